@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -18,6 +17,7 @@ from pathreplay.output.picture import Told, file_bytes, find_sensor, render, set
 from pathreplay.platform.atomic_files import require_writable, write_whole
 from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.loading import load_scene
+from pathreplay.types import Json
 
 _OPTION = "-o"
 _SECONDS = 10.0
@@ -78,9 +78,9 @@ def render_to_file(scene: str, output: Path, asked: RenderOptions, progress: boo
     return f"{output}: {width} x {height}, {rendering.spp} samples per pixel, {seconds:.3g} s"
 
 
-def _flat(option: str, table: dict[str, Any], changes: Sequence[str]) -> dict[str, Any]:
+def _flat(option: str, table: Json, changes: Sequence[str]) -> Json:
     """Add each NAME=VALUE to the table. Raises PathreplayError for nested values."""
-    result: dict[str, Any] = defined(table, changes, option)
+    result = defined(table, changes, option)
     for name, value in result.items():
         if isinstance(value, (dict, list)):
             raise PathreplayError(f"{option} {name} is {shown(value)}; give a number, a string, true or false")

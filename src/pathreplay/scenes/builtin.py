@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from pathreplay.scenes.bodies import ball, knobs, mesh
-
-SceneDict = dict[str, Any]
+from pathreplay.types import SceneDict
 
 COSTS: dict[str, Callable[[int], int]] = {
     "texture": lambda n: 64 * n**2,  # three numbers per texel, with copies in double precision
@@ -21,7 +19,7 @@ COSTS: dict[str, Callable[[int], int]] = {
 """Arguments that can make a scene too large -> approximate memory to build it, in bytes."""
 
 
-def _picture(pixels: np.ndarray, **options: Any) -> SceneDict:
+def _picture(pixels: np.ndarray, **options: object) -> SceneDict:
     """A bitmap texture whose values are used without colour conversion."""
     return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, **options}
 
@@ -261,7 +259,7 @@ def silhouette_in_mirror(resolution: int = 32) -> SceneDict:
     return {**scene, "integrator": {"type": "path", "max_depth": 3}, "view1": camera, "mirror": mirror}
 
 
-def _panel(place: Any, *colour: float) -> SceneDict:
+def _panel(place: mi.ScalarTransform4f, *colour: float) -> SceneDict:
     """A rectangle that glows in one colour and reflects nothing."""
     black = {"type": "diffuse", "reflectance": 0.0}
     glow = {"type": "area", "radiance": {"type": "rgb", "value": list(colour)}}
@@ -274,7 +272,7 @@ def flat_colours(resolution: int = 32) -> SceneDict:
     The camera, key ``camera.to_world``, looks at them from three units away.
     """
 
-    def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> Any:
+    def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> mi.ScalarTransform4f:
         return mi.ScalarTransform4f().translate([x, y, z]).rotate([0, 0, 1], turn).scale([width, height, 1])
 
     return {
@@ -294,7 +292,7 @@ def glass_ball(resolution: int = 32) -> SceneDict:
     Keys: ``glass.eta`` and ``ball.to_world``.
     """
 
-    def at(x: float, y: float, z: float, width: float, height: float) -> Any:
+    def at(x: float, y: float, z: float, width: float, height: float) -> mi.ScalarTransform4f:
         return mi.ScalarTransform4f().translate([x, y, z]).scale([width, height, 1])
 
     return {

@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
 
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 
 
-def require_values(description: Mapping[str, Any]) -> None:
+def require_values(description: Mapping[str, object]) -> None:
     """Raise PathreplayError if a value of a dictionary, nested or not, is None: Mitsuba crashes on it (SIGSEGV)."""
     for name, value in description.items():
         if value is None:
@@ -23,7 +22,7 @@ def require_values(description: Mapping[str, Any]) -> None:
             require_values(value)
 
 
-def load_integrator(description: Mapping[str, Any]) -> mi.Integrator:
+def load_integrator(description: Mapping[str, object]) -> mi.Integrator:
     """Load the integrator that a dictionary describes. Raises PathreplayError if Mitsuba cannot create it."""
     require_values(description)
     name = description.get("type")

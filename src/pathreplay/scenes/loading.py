@@ -9,7 +9,6 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -27,7 +26,7 @@ from pathreplay.scenes.substitute import Cameras, load_dict_with, load_file_with
 _COARSE = "BitmapTextureImpl[uint8]"
 
 
-def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any) -> mi.Scene:
+def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: object) -> mi.Scene:
     """Load a scene so that its parameter keys keep the names in the file.
 
     ``spec`` is the path of a Mitsuba XML file (relative paths start at ``base``, or at the current folder) or the name
@@ -47,7 +46,7 @@ def load_scene_with(
     cameras: Cameras | None = None,
     floats: Collection[str] = (),
     /,
-    **parameters: Any,
+    **parameters: object,
 ) -> tuple[mi.Scene, list[str]]:
     """`load_scene` with plugins replaced (old type -> new type); also returns id and position of each, one line each.
 
@@ -77,7 +76,7 @@ def load_scene_with(
     return scene, exchanged
 
 
-def _copied(description: Mapping[str, Any]) -> SceneDict:
+def _copied(description: Mapping[str, object]) -> SceneDict:
     """Copy a dictionary and its tensors: Mitsuba moves tensors out of a dictionary that it loads."""
     return {
         name: _copied(value) if isinstance(value, Mapping) else type(value)(value) if dr.is_array_v(value) else value
@@ -85,7 +84,7 @@ def _copied(description: Mapping[str, Any]) -> SceneDict:
     }
 
 
-def as_xml_has_them(parameters: Mapping[str, Any]) -> dict[str, str]:
+def as_xml_has_them(parameters: Mapping[str, object]) -> dict[str, str]:
     """Scene parameters as XML text: true instead of True."""
     return {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
 
@@ -96,7 +95,7 @@ def load_scene_for(
     base: Path | None = None,
     cameras: Cameras | None = None,
     /,
-    **parameters: Any,
+    **parameters: object,
 ) -> tuple[mi.Scene, tuple[str, ...]]:
     """Load a scene in which ``wanted`` keys and globs are differentiable, replacing plugins where that is necessary.
 
@@ -126,7 +125,7 @@ def load_scene_for(
 
 
 def load_scene_with_floats(
-    spec: str | Path, wanted: Iterable[str], base: Path | None = None, /, **parameters: Any
+    spec: str | Path, wanted: Iterable[str], base: Path | None = None, /, **parameters: object
 ) -> mi.Scene:
     """`load_scene` with floating-point texels in those 8-bit textures that ``wanted`` keys and globs name."""
     scene = load_scene(spec, base, **parameters)
@@ -137,14 +136,14 @@ def load_scene_with_floats(
     return load_scene_with(spec, {}, base, None, floats, **parameters)[0]
 
 
-def coarse_pictures(params: Any, wanted: Iterable[str]) -> tuple[str, ...]:
+def coarse_pictures(params: mi.SceneParameters, wanted: Iterable[str]) -> tuple[str, ...]:
     """Files of the 8-bit textures that keys and globs ending in ``data`` name."""
     owners = [params.properties[key][2] for key in _matching(params, wanted, "data")]
     matches = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
     return tuple(dict.fromkeys(match[1] for match in matches if match))
 
 
-def _matching(params: Any, wanted: Iterable[str], name: str) -> list[str]:
+def _matching(params: mi.SceneParameters, wanted: Iterable[str], name: str) -> list[str]:
     """Keys that match the patterns whose last part is ``name``."""
     keys: list[str] = []
     for pattern in wanted:
@@ -154,7 +153,7 @@ def _matching(params: Any, wanted: Iterable[str], name: str) -> list[str]:
     return keys
 
 
-def builtin_dict(name: str, parameters: Mapping[str, Any]) -> SceneDict:
+def builtin_dict(name: str, parameters: Mapping[str, object]) -> SceneDict:
     """The dictionary of a built-in scene. Raises PathreplayError for a wrong parameter."""
     make = BUILTINS[name]
     known = inspect.signature(make).parameters

@@ -6,11 +6,10 @@ import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import BinaryIO
 
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 
@@ -32,10 +31,10 @@ class _Element:
     def kinds(self) -> list[str]:
         return [kinds[0] for kinds in self.properties]
 
-    def layout(self, form: str) -> np.dtype[Any]:
+    def layout(self, form: str) -> np.dtype[np.void]:
         """Data type of one entry, with lists of three items. Numbers in text files are read in double precision."""
         order = "<" if form == "binary_little_endian" else ">"
-        fields: list[Any] = []
+        fields: list[tuple[str, str] | tuple[str, str, int]] = []
         for i, (*kinds, _) in enumerate(self.properties):
             *count, number = ("f8" if form == "ascii" else order + _TYPES[kind] for kind in kinds if kind != "list")
             fields += [(f"count {i}", count[0]), (f"{i}", number, 3)] if count else [(f"{i}", number)]
@@ -66,7 +65,7 @@ def require_sound_ply(path: Path) -> None:
         _require_vertices(path, indices, vertices)
 
 
-def _ply_header(file: Any) -> tuple[str | None, list[_Element]]:
+def _ply_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
     form, elements = None, []
     for _ in range(1000):
         words = file.readline(4096).decode("latin-1").split()
@@ -81,7 +80,7 @@ def _ply_header(file: Any) -> tuple[str | None, list[_Element]]:
     return None, []
 
 
-def _triangles(file: Any, elements: list[_Element], form: str) -> NDArray[Any] | None:
+def _triangles(file: BinaryIO, elements: list[_Element], form: str) -> np.ndarray | None:
     """Vertex indices of the faces, (n, 3); None for missing data or non-triangular faces, which Mitsuba rejects."""
     vertex, face = (element.layout(form) for element in elements[:2])
     with warnings.catch_warnings():
@@ -100,7 +99,7 @@ def _triangles(file: Any, elements: list[_Element], form: str) -> NDArray[Any] |
 _ENTRIES = {b"\x1c\x04\x03\0": 4, b"\x1c\x04\x04\0": 8}
 
 
-def require_sound_serialized(path: Path, index: Any) -> None:
+def require_sound_serialized(path: Path, index: object) -> None:
     """Raise PathreplayError unless the table of shapes fits into the file and shape ``index`` has valid vertex indices.
 
     Mitsuba detects other damage itself.
@@ -126,7 +125,7 @@ def require_sound_serialized(path: Path, index: Any) -> None:
         _require_vertices(path, np.array(mi.traverse(mesh)["faces"]), mesh.vertex_count())
 
 
-def _require_vertices(path: Path, indices: NDArray[Any], vertices: int) -> None:
+def _require_vertices(path: Path, indices: np.ndarray, vertices: int) -> None:
     """Raise PathreplayError if a face refers to a vertex that does not exist."""
     low, high = int(indices.min()), int(indices.max())
     if low < 0 or high >= vertices:

@@ -11,13 +11,21 @@ import fnmatch
 import math
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pathreplay.errors import PathreplayError
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
+
+T = TypeVar("T")
+SceneValue: TypeAlias = "dr.ArrayBase | mi.Transform4f"
+"""A differentiable value of `mi.SceneParameters`."""
 
 # Remedies for values that Mitsuba 3.9 stores without derivative: (class of the owner, last part of the key).
 _WAY_OUT = {
@@ -42,7 +50,7 @@ _WAY_OUT = {
 }
 
 
-def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> list[str]:
+def resolve_keys(params: Mapping[str, object], patterns: str | Iterable[str]) -> list[str]:
     """The keys that match ``patterns``, in the order of the patterns, then of the scene; each key once.
 
     A pattern is an exact key or a shell-style glob (``*``, ``?``, ``[abc]``). Globs match whole keys, dots included.
@@ -63,7 +71,7 @@ def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> li
     return list(selected)
 
 
-def keep_only(params: Any, keys: Iterable[str]) -> None:
+def keep_only(params: mi.SceneParameters, keys: Iterable[str]) -> None:
     """Reduce ``mi.traverse(scene)`` to exactly these keys; Mitsuba's own ``keep`` treats them as regexes."""
     params.keep([rf"{re.escape(key)}\Z" for key in keys])
 
@@ -80,12 +88,12 @@ def _no_match(known: list[str], pattern: str) -> str:
     return f"No parameter '{pattern}' in the scene, and no similar one; mitsuba.traverse(scene) lists all {len(known)}"
 
 
-def owner_class(params: Any, key: str) -> str:
+def owner_class(params: mi.SceneParameters, key: str) -> str:
     """Name of the class that owns a parameter (not of the plugin: 'SmoothDielectric', not 'dielectric')."""
     return str(params.properties[key][2].class_name())
 
 
-def require_differentiable(params: Any, key: str, integrator: Any = None) -> None:
+def require_differentiable(params: mi.SceneParameters, key: str, integrator: mi.Integrator | None = None) -> None:
     """Raise PathreplayError unless ``integrator`` (None: any of Mitsuba's) can differentiate ``key``.
 
     It cannot if the key does not exist, is a plain number, holds integers, or is marked
@@ -117,7 +125,7 @@ def require_differentiable(params: Any, key: str, integrator: Any = None) -> Non
     raise PathreplayError(f"Parameter '{key}' carries no derivative: {why}; choose one that mi.traverse marks with ∂")
 
 
-def require_settable(params: Any, key: str) -> None:
+def require_settable(params: mi.SceneParameters, key: str) -> None:
     """Raise PathreplayError, with the remedy, unless floating-point numbers can be assigned to a parameter."""
     value = params[key]
     if isinstance(value, float) or _is_float(value):
@@ -127,7 +135,9 @@ def require_settable(params: Any, key: str) -> None:
     raise PathreplayError(f"Parameter '{key}' cannot be given a value: {why}")
 
 
-def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrator: Any = None) -> list[str]:
+def resolve_differentiable(
+    params: mi.SceneParameters, patterns: str | Iterable[str], integrator: mi.Integrator | None = None
+) -> list[str]:
     """Like :func:`resolve_keys`, but a glob selects only matches that carry a derivative.
 
     Raises PathreplayError if a pattern matches nothing, or nothing that carries a derivative.
@@ -142,7 +152,7 @@ def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrato
     return list(selected)
 
 
-def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
+def carries_derivative(params: mi.SceneParameters, key: str, integrator: mi.Integrator | None = None) -> bool:
     """Whether a parameter is differentiable: a non-empty Dr.Jit float array that Mitsuba does not exclude.
 
     Of the parameters that Mitsuba excludes, ``pathreplay`` (unless ``attach`` is 'none') differentiates cameras and the
@@ -162,41 +172,41 @@ _CAMERA = {"to_world", "x_fov", "aperture_radius", "focus_distance"} | _PRINCIPA
 _LIGHT = {"to_world", "position"}
 
 
-def needs_ray_adjoint(params: Any, key: str) -> bool:
+def needs_ray_adjoint(params: mi.SceneParameters, key: str) -> bool:
     """Whether a parameter belongs to a camera or moves an emitter without a shape; Mitsuba's integrators drop these."""
     node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
     placed = (isinstance(node, mi.Sensor) and name in _CAMERA) or (isinstance(node, mi.Emitter) and name in _LIGHT)
     return placed and _is_float(params[key])
 
 
-def is_transform(value: Any) -> bool:
+def is_transform(value: object) -> TypeIs[mi.Transform4f]:
     """Whether a value is a transform of Dr.Jit floats, like ``to_world``."""
     # Every Dr.Jit array also has .matrix. Scalar transforms (texture to_uv) hold no Dr.Jit array and have no
     # derivative.
     return not dr.is_array_v(value) and hasattr(value, "matrix") and dr.is_diff_v(value.matrix)
 
 
-def _array(value: Any) -> Any:
+def _array(value: T) -> T | mi.Matrix4f:
     """The Dr.Jit array of a value; for a transform, its matrix."""
     return value.matrix if is_transform(value) else value
 
 
-def _is_float(value: Any) -> bool:
+def _is_float(value: object) -> bool:
     array = _array(value)
     return bool(dr.is_array_v(array) and dr.is_float_v(array) and dr.is_diff_v(array))
 
 
-def is_empty(value: Any) -> bool:
+def is_empty(value: object) -> bool:
     """Whether an array has no entries, like the texture coordinates of a mesh without any."""
     return 0 in dr.shape(_array(value))
 
 
-def require_finite(params: Any) -> None:
+def require_finite(params: mi.SceneParameters) -> None:
     """Raise PathreplayError, with key and index, if a parameter holds a NaN or an infinity.
 
     A plain number may be infinite, as distances can be. The cost is one reduction per array.
     """
-    counts: dict[str, Any] = {}
+    counts: dict[str, mi.UInt32] = {}
     for key in params.keys():
         value = params[key]
         if isinstance(value, float) and math.isnan(value):
@@ -215,7 +225,7 @@ def require_finite(params: Any) -> None:
             )
 
 
-def get_array(value: Any) -> np.ndarray:
+def get_array(value: SceneValue | float) -> np.ndarray:
     """A floating-point parameter value as a NumPy array in its own precision; a copy, without derivatives.
 
     Shapes: a plain number (1,); ``Float`` (n,); ``Color3f`` and similar types (3,), or (3, n) for n colours;
@@ -229,7 +239,7 @@ def get_array(value: Any) -> np.ndarray:
     return array
 
 
-def to_value(like: Any, array: Any) -> Any:
+def to_value(like: SceneValue | float, array: ArrayLike) -> Any:
     """The inverse of :func:`get_array`: ``array`` as a value of the type of ``like``.
 
     Raises PathreplayError if the shapes differ.
@@ -246,7 +256,7 @@ def to_value(like: Any, array: Any) -> Any:
     return type(like)(given)
 
 
-def displaced(value: Any, direction: np.ndarray, t: Any) -> Any:
+def displaced(value: SceneValue, direction: np.ndarray, t: mi.Float) -> SceneValue:
     """``value + t * direction`` for a differentiable scalar ``t`` (``mi.Float`` of size 1), in the type of ``value``.
 
     ``direction`` has the shape of ``get_array(value)``. For transforms the matrices are added, so that ``direction``

@@ -6,7 +6,6 @@ Errors that Mitsuba itself reports (OBJ indices, truncated meshes, unknown forma
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 from xml.parsers import expat
 
 import mitsuba as mi
@@ -63,7 +62,7 @@ def _included(path: Path) -> list[str]:
     return names
 
 
-def require_sound_files(state: Any) -> None:
+def require_sound_files(state: mi.parser.ParserState) -> None:
     """Raise PathreplayError if a parsed scene (`mi.parser`) refers to a file that is unsafe to give to Mitsuba.
 
     Checked are pipes and devices, on which Mitsuba would block, the indices of PLY and serialized meshes, the sizes of
@@ -91,7 +90,7 @@ def require_sound_files(state: Any) -> None:
             require_sound_serialized(path, node.props.get("shape_index", 0))
 
 
-def _require_shapes(state: Any, group: Any) -> None:
+def _require_shapes(state: mi.parser.ParserState, group: mi.parser.SceneNode) -> None:
     """Raise PathreplayError for an empty shape group; Dr.Jit crashes on its instances."""
     by_id = {node.props.id(): node for node in state.nodes}
     for key in group.props.keys():

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +20,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import errors_as, load_integrator
 from pathreplay.scenes.loading import load_scene_for
-from pathreplay.scenes.parameters import get_array, is_transform, resolve_differentiable
+from pathreplay.scenes.parameters import SceneValue, get_array, is_transform, resolve_differentiable
 from pathreplay.scenes.stored import form_of
 
 
@@ -49,9 +49,9 @@ class SceneFunction:
         scene: mi.Scene | str | Path,
         keys: str | Iterable[str],
         *,
-        integrator: Mapping[str, Any] | None = None,
+        integrator: Mapping[str, object] | None = None,
         spp: int = 16,
-        arguments: Mapping[str, Any] | None = None,
+        arguments: Mapping[str, object] | None = None,
     ) -> None:
         patterns = [keys] if isinstance(keys, str) else list(keys)
         if isinstance(scene, (str, Path)):
@@ -126,7 +126,7 @@ class SceneFunction:
         return seen
 
 
-def _typed(kind: type, tensor: Any) -> Any:
+def _typed(kind: type, tensor: mi.TensorXf) -> SceneValue:
     """Convert a tensor to a value of the given type, differentiably."""
     if dr.is_tensor_v(kind):
         return tensor

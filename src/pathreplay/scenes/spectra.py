@@ -9,7 +9,7 @@ for colours of low saturation.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +24,7 @@ TO_COEFFICIENTS = np.linalg.inv(np.vander(WAVELENGTHS))
 _COLOURS = ("SRGBReflectanceSpectrum", "D65Spectrum")
 
 
-def coefficient_channels(params: Any, key: str) -> int:
+def coefficient_channels(params: mi.SceneParameters, key: str) -> int:
     """Number of channels of a parameter that holds coefficients: 3, or 4 with a factor; 0 for all others."""
     if not mi.is_spectral:
         return 0
@@ -50,7 +50,7 @@ def values_of_p(c: np.ndarray) -> np.ndarray:
     return np.concatenate([c[..., :3] @ np.vander(WAVELENGTHS).T, c[..., 3:]], axis=-1)
 
 
-def spectrum(c: Any, wavelength: float) -> Any:
+def spectrum(c: Sequence[mi.Float] | mi.Vector3f, wavelength: float) -> mi.Float:
     """S at a wavelength (nm), from Dr.Jit coefficients."""
     p = (c[0] * wavelength + c[1]) * wavelength + c[2]
     return 0.5 + 0.5 * p * dr.rsqrt(1 + dr.square(p))

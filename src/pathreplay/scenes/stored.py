@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
+from pathreplay.scenes.parameters import SceneValue
 from pathreplay.scenes.spectra import TO_COEFFICIENTS, WAVELENGTHS, coefficient_channels, spectrum
 
 Array = NDArray[np.float32]
@@ -38,11 +39,11 @@ _MARGIN = 1e-4
 class Form:
     """The form of most parameters: decoded values are the stored ones."""
 
-    def see(self, stored: Any) -> Any:
+    def see(self, stored: SceneValue) -> SceneValue:
         """The decoded Dr.Jit value, without derivatives."""
         return stored
 
-    def store(self, seen: Any) -> Any:
+    def store(self, seen: SceneValue) -> SceneValue:
         """The Dr.Jit value for Mitsuba, differentiable in the decoded value."""
         return seen
 
@@ -60,10 +61,10 @@ AS_STORED = Form()
 class Half(Form):
     """Textures stored in half precision."""
 
-    def see(self, stored: Any) -> Any:
+    def see(self, stored: SceneValue) -> SceneValue:
         return mi.TensorXf(dr.detach(stored))
 
-    def store(self, seen: Any) -> Any:
+    def store(self, seen: SceneValue) -> SceneValue:
         return mi.TensorXf16(seen)
 
 
@@ -73,11 +74,12 @@ class Sky(Form):
 
     mono: bool
 
-    def see(self, stored: Any) -> Any:
+    def see(self, stored: SceneValue) -> SceneValue:
         columns = np.array(dr.detach(stored))[:, 1:-1]
         return mi.TensorXf(np.ascontiguousarray(columns[..., :1] if self.mono else columns))
 
-    def store(self, seen: Any) -> Any:
+    def store(self, seen: SceneValue) -> SceneValue:
+        assert dr.is_tensor_v(seen)
         height, width, channels = seen.shape
         shape = (height, width + 2, 3 if self.mono else channels)
         entry = dr.arange(mi.UInt32, math.prod(shape))
@@ -94,13 +96,13 @@ class Spectra(Form):
     scaled: bool = False
     inner: Form = AS_STORED
 
-    def see(self, stored: Any) -> Any:
+    def see(self, stored: SceneValue) -> SceneValue:
         stored = self.inner.see(dr.detach(stored))
         entries = _entries(stored, 4 if self.scaled else 3)
         S = mi.Vector3f(*(spectrum(entries, wavelength) for wavelength in WAVELENGTHS))
         return _like(stored, S * entries[3] if self.scaled else S)
 
-    def store(self, seen: Any) -> Any:
+    def store(self, seen: SceneValue) -> SceneValue:
         S = mi.Vector3f(*_entries(seen, 3))
         # As in Mitsuba, the largest entry is scaled to one half, where spectra are smooth.
         factor = dr.maximum(2 * dr.max(S), 1e-8) if self.scaled else mi.Float(1)
@@ -135,7 +137,7 @@ class EmitterColour(Spectra):
         )
 
 
-def form_of(params: Any, key: str) -> Form:
+def form_of(params: mi.SceneParameters, key: str) -> Form:
     """The form in which the parameter ``key`` of ``mi.traverse(scene)`` is stored."""
     value, owner = params[key], params.properties[key][2]
     kind, name = str(owner.class_name()), key.rsplit(".", 1)[-1]
@@ -147,13 +149,13 @@ def form_of(params: Any, key: str) -> Form:
     return EmitterColour() if kind == "D65Spectrum" else Spectra(scaled=channels == 4, inner=form)
 
 
-def _entries(value: Any, channels: int) -> Any:
+def _entries(value: SceneValue, channels: int) -> Any:
     """The channels of a colour or tensor, one flat array each."""
     kind = mi.Vector3f if channels == 3 else mi.Vector4f
     return dr.unravel(kind, value.array) if dr.is_tensor_v(value) else value
 
 
-def _like(value: Any, entries: Any) -> Any:
+def _like(value: SceneValue, entries: mi.Vector3f | mi.Vector4f) -> SceneValue:
     """Combine channels into a colour or tensor like ``value``, with as many channels as given."""
     if not dr.is_tensor_v(value):
         return type(value)(entries)

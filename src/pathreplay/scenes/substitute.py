@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 
@@ -17,7 +16,7 @@ from pathreplay.platform.threads import spare_thread
 from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 
-Cameras = Mapping[str, Mapping[str, Any]]
+Cameras = Mapping[str, Mapping[str, object]]
 """Sensors by id, as Mitsuba dictionaries."""
 
 
@@ -27,7 +26,7 @@ def load_file_with(
     parameters: Mapping[str, str] | None = None,
     cameras: Cameras | None = None,
     floats: Collection[str] = (),
-) -> tuple[Any, list[str]]:
+) -> tuple[mi.Scene, list[str]]:
     """`mi.load_file(path, optimize=False, **parameters)` with plugins replaced, also in included files.
 
     `plugins` maps the type named in the scene to the type to load instead, e.g. {"dielectric": "dielectric_ad"}. The
@@ -51,11 +50,11 @@ def load_file_with(
 
 
 def load_dict_with(
-    scene: Mapping[str, Any],
+    scene: Mapping[str, object],
     plugins: Mapping[str, str],
     cameras: Cameras | None = None,
     floats: Collection[str] = (),
-) -> tuple[Any, list[str]]:
+) -> tuple[mi.Scene, list[str]]:
     """`mi.load_dict(scene, optimize=False)` with plugins replaced; otherwise like `load_file_with`.
 
     Objects in the dictionary that are already loaded are left unchanged. Raises PathreplayError for a value of None.
@@ -65,7 +64,7 @@ def load_dict_with(
         return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins, cameras, floats)
 
 
-def exchange(props: Any, plugins: Mapping[str, str], floats: Collection[str]) -> bool:
+def exchange(props: mi.Properties, plugins: Mapping[str, str], floats: Collection[str]) -> bool:
     """Replace the plugin of an object, or set its option, in its properties; return whether the plugin was replaced."""
     if (new := plugins.get(props.plugin_name())) is not None:
         props.set_plugin_name(new)
@@ -90,8 +89,12 @@ def _parsing() -> Iterator[mi.parser.ParserConfig]:
 
 
 def _instantiate(
-    config: Any, state: Any, plugins: Mapping[str, str], cameras: Cameras | None, floats: Collection[str]
-) -> tuple[Any, list[str]]:
+    config: mi.parser.ParserConfig,
+    state: mi.parser.ParserState,
+    plugins: Mapping[str, str],
+    cameras: Cameras | None,
+    floats: Collection[str],
+) -> tuple[mi.Scene, list[str]]:
     exchanged = []
     taken = {node.props.id() for node in state.nodes}
     for name, camera in (cameras or {}).items():

@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.files import file_problem
 from pathreplay.scenes.nanovdb_header import require_whole_nanovdb
+from pathreplay.types import SceneDict
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 
@@ -87,12 +89,12 @@ def _require_small(path: Path, data: NDArray[np.float32]) -> None:
         )
 
 
-def save_vol(path: str | Path, data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> None:
+def save_vol(path: str | Path, data: np.ndarray, bounds: Bounds = UNIT_CUBE) -> None:
     """Write a grid of shape (z, y, x) or (z, y, x, channels) as a Mitsuba `.vol` file (version 3, float32)."""
     Path(path).write_bytes(vol_bytes(data, bounds))
 
 
-def vol_bytes(data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> bytes:
+def vol_bytes(data: np.ndarray, bounds: Bounds = UNIT_CUBE) -> bytes:
     """The `.vol` file of a grid; ``bounds`` is the box that it fills, used if `use_grid_bbox` is set.
 
     Raises PathreplayError for data that have neither three nor four dimensions, or no voxels.
@@ -113,7 +115,7 @@ def vol_bounds(vol: bytes) -> Bounds:
     return (x, y, z), (X, Y, Z)
 
 
-def grid_volume(path: str | Path, grid: str | None = None, **options: Any) -> dict[str, Any]:
+def grid_volume(path: str | Path, grid: str | None = None, **options: object) -> SceneDict:
     """A volume file as a `gridvolume` for a scene dictionary, positioned in the world space of the file.
 
     ``options`` are properties of the plugin (``filter_type``, ``wrap_mode``, ``raw``); ``to_world`` replaces that of
@@ -178,7 +180,7 @@ def _read_vol(path: Path, grid: str | None) -> Volume:
     return Volume(values.reshape(z, y, x, channels), _scaled(np.subtract(box[3:], box[:3]), box[:3]), "")
 
 
-def _scaled(scale: Any, translation: Any) -> NDArray[np.float64]:
+def _scaled(scale: Iterable[float], translation: ArrayLike) -> NDArray[np.float64]:
     """The 4 x 4 matrix (for column vectors) that scales along the axes, then translates."""
     matrix = np.diag([*map(float, scale), 1.0])
     matrix[:3, 3] = translation
@@ -216,7 +218,7 @@ def _require_all_voxels(where: str, source: Any, read: int) -> None:
         )
 
 
-def _index_to_world(transform: dict[str, Any]) -> NDArray[np.float64]:
+def _index_to_world(transform: SceneDict) -> NDArray[np.float64]:
     """The index-to-world map as a matrix for column vectors."""
     if "affine" in transform["type"]:
         return np.array(transform["matrix"]).T  # OpenVDB uses row vectors
@@ -253,7 +255,7 @@ def _read_nvdb(path: Path, grid: str | None) -> Volume:
 
 
 @contextmanager
-def _vdb_reader(path: Path) -> Iterator[Any]:
+def _vdb_reader(path: Path) -> Iterator[ModuleType]:
     try:
         import tinyvdb
     except ImportError:
@@ -276,7 +278,7 @@ def _chosen(path: Path, grid: str | None, names: list[str]) -> int:
     return names.index(grid)
 
 
-def _size(where: str, low: NDArray[Any], high: NDArray[Any], most: int = _MOST_VOXELS) -> tuple[int, ...]:
+def _size(where: str, low: np.ndarray, high: np.ndarray, most: int = _MOST_VOXELS) -> tuple[int, ...]:
     """Number of voxels along x, y, z of an index box given by its first and last voxel."""
     shape = tuple(int(n) for n in np.asarray(high, np.int64) - low + 1)
     if min(shape) < 1 or np.prod(shape, dtype=np.float64) > most:
@@ -285,7 +287,7 @@ def _size(where: str, low: NDArray[Any], high: NDArray[Any], most: int = _MOST_V
     return shape
 
 
-def _placed(data: NDArray[np.float32], index_to_world: NDArray[np.float64], low: NDArray[Any], name: str) -> Volume:
+def _placed(data: NDArray[np.float32], index_to_world: NDArray[np.float64], low: np.ndarray, name: str) -> Volume:
     """Volume of ``data`` by index (x, y, z), from index ``low`` on; sample (i, j, k) is the centre of its voxel."""
     box = _scaled(data.shape, low - 0.5)
     return Volume(np.ascontiguousarray(data.transpose(2, 1, 0)[..., None]), index_to_world @ box, name)

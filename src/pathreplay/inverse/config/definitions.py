@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.parsing import from_toml
+
+T = TypeVar("T")
 
 DEEPEST = 16
 """Largest number of parts of a dotted key; the tables of a job are far less deep."""
 _VALUES = (bool, int, float, str, list, dict)
 
 
-def defined(job: Any, changes: Sequence[str], option: str = "--set") -> Any:
+def defined(job: T, changes: Sequence[str], option: str = "--set") -> T:
     """Return a copy of the job with overrides applied; ``job`` itself is not changed.
 
     Args:
@@ -49,7 +51,7 @@ def _path(key: str, option: str) -> list[str]:
     return path
 
 
-def _value(text: str) -> Any:
+def _value(text: str) -> object:
     try:
         table = from_toml(f"value = {text}")
     except (ValueError, RecursionError):
@@ -57,7 +59,7 @@ def _value(text: str) -> Any:
     return table["value"] if len(table) == 1 and isinstance(table["value"], _VALUES) else text
 
 
-def _put(table: Any, path: list[str], value: Any, option: str) -> Any:
+def _put(table: object, path: list[str], value: object, option: str) -> Any:
     if not path:
         return value
     name, *rest = path

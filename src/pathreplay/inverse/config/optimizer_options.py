@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import model_validator
 
 from pathreplay.inverse.config.tables import Count, Positive, Share, Switch, Table
+from pathreplay.types import Json
 
 
 class Optimizer(Table):
@@ -58,7 +59,7 @@ class Optimizer(Table):
         """Whether it compares losses between iterations, which then all use the same random numbers."""
         return self.type == "l-bfgs-b"
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Json:
         """Return all options of the type, with defaults for those that are not given."""
         return DEFAULTS[self.type] | self.model_dump(exclude={"type"}, exclude_none=True)
 
@@ -71,7 +72,7 @@ _ADAM = {
     "uniform": False,
     "amsgrad": False,
 }
-DEFAULTS: dict[str, dict[str, Any]] = {
+DEFAULTS: dict[str, dict[str, float | bool]] = {
     "adam": _ADAM,
     "adamw": {**_ADAM, "weight_decay": 0.01},
     "sgd": {"momentum": 0.0, "nesterov": False},

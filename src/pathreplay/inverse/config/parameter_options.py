@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
@@ -55,7 +55,7 @@ class Displacement(Table):
     """Rotation vector in degrees."""
 
 
-def _kind_of_initial(value: Any) -> str:
+def _kind_of_initial(value: object) -> str:
     names = list(value) if isinstance(value, dict) else []
     posed = any(difflib.get_close_matches(str(name), Displacement.model_fields, n=1) for name in names)
     return "Displacement" if posed or isinstance(value, Displacement) else "Value"

@@ -7,11 +7,12 @@ import re
 import sys
 from collections.abc import Callable, Hashable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import yaml
 
 from pathreplay.errors import PathreplayError, shown
+from pathreplay.types import Json
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -33,7 +34,7 @@ def most_bytes(path: Path) -> int:
     return _LONGEST_YAML if path.suffix.lower() in YAML else _LONGEST
 
 
-def parsed(path: Path, text: str) -> Any:
+def parsed(path: Path, text: str) -> object:
     """Parse the text of a file in the format of its suffix. Raises PathreplayError for syntax errors."""
     kind, read = _FORMATS.get(path.suffix.lower(), ("TOML", tomllib.loads))
     try:
@@ -47,7 +48,7 @@ def parsed(path: Path, text: str) -> Any:
         raise PathreplayError(f"Config {path} has a number with more digits than Python reads; shorten it") from None
 
 
-def from_toml(text: str) -> dict[str, Any]:
+def from_toml(text: str) -> Json:
     """Parse TOML. Raises ValueError or RecursionError."""
     return tomllib.loads(text)
 
@@ -58,7 +59,7 @@ class _Plain(yaml.SafeLoader):
     Duplicate keys and tags are errors, and so are anchors, which can expand a few lines to billions of nodes.
     """
 
-    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}
+    yaml_implicit_resolvers: ClassVar[dict[str, list[object]]] = {}
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -79,7 +80,7 @@ class _Plain(yaml.SafeLoader):
         self._depth -= 1
         return node
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
         keys: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag != "tag:yaml.org,2002:str":
@@ -111,11 +112,11 @@ def _of_yaml(error: yaml.YAMLError) -> str:
     return f"{getattr(error, 'problem', None) or error}{where}"
 
 
-def _yaml(text: str) -> Any:
+def _yaml(text: str) -> object:
     return yaml.load(text, _Plain)
 
 
-_FORMATS: dict[str, tuple[str, Callable[[str], Any]]] = {
+_FORMATS: dict[str, tuple[str, Callable[[str], object]]] = {
     ".json": ("JSON", json.loads),
     **dict.fromkeys(YAML, ("YAML", _yaml)),
 }

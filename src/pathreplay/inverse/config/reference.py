@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from typing import Any
 
 from pathreplay.inverse.config.schema import Config
+from pathreplay.types import Json
 
 HEAD = """# Keys of a job
 
@@ -45,7 +45,7 @@ def reference() -> str:
     return "\n".join([HEAD, *tables])
 
 
-def _table(title: str, of: dict[str, Any]) -> str:
+def _table(title: str, of: Json) -> str:
     needed = of.get("required", [])
     lines = [f"## {title}", "", "| key | type | default | meaning |", "| --- | --- | --- | --- |"]
     for key, about in of["properties"].items():
@@ -55,17 +55,17 @@ def _table(title: str, of: dict[str, Any]) -> str:
     return "\n".join([*lines, ""])
 
 
-def _default(about: dict[str, Any]) -> str:
+def _default(about: Json) -> str:
     value = about.get("default")
     return "" if value is None or isinstance(value, (dict, list)) else f"`{json.dumps(value)}`"
 
 
-def _kind(about: dict[str, Any]) -> str:
+def _kind(about: Json) -> str:
     """Describe the types of a key's values; ranges are left to the error messages."""
     return " or ".join(dict.fromkeys(_kinds(about)))
 
 
-def _kinds(about: dict[str, Any]) -> Iterator[str]:
+def _kinds(about: Json) -> Iterator[str]:
     for one in about.get("anyOf") or about.get("oneOf") or []:
         yield from _kinds(one)
     if "$ref" in about:

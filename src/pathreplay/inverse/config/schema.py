@@ -26,6 +26,7 @@ from pathreplay.inverse.config.stage_options import Stage, begins
 from pathreplay.inverse.config.tables import Argument, Count, Plugin, Positive, Switch, Table, Whole
 from pathreplay.inverse.config.target_options import NOTHING, Capture, Exposure, Target
 from pathreplay.platform.files import MISSING, file_problem
+from pathreplay.types import Json
 
 PIXELWISE = ("l2", "relative-l2")
 """Losses that support pixel batches: the names of `losses.QUADRATIC`."""
@@ -348,12 +349,12 @@ def read_table(path: Path, changes: Sequence[str] = ()) -> Any:
     return defined(parsed(path, text), changes)
 
 
-def make_config(values: dict[str, Any], name: str = "config") -> Config:
+def make_config(values: Json, name: str = "config") -> Config:
     """Make a job from a dictionary, with the checks and messages of `load_config`; messages call it ``name``."""
     return _checked(name, values)
 
 
-def _checked(name: str, job: Any) -> Config:
+def _checked(name: str, job: object) -> Config:
     try:
         return Config.model_validate(job)
     except ValidationError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from numbers import Integral, Real
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -14,11 +14,11 @@ from pydantic_core import PydanticCustomError
 from pathreplay.errors import shown
 
 
-def _whole(value: Any) -> Any:
+def _whole(value: object) -> object:
     return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value
 
 
-def _single(value: Any) -> Any:
+def _single(value: object) -> object:
     """Convert a number to a float; reject values beyond single precision, in which Mitsuba computes."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return value
@@ -48,7 +48,7 @@ class Table(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _is_a_table(cls, value: Any) -> Any:
+    def _is_a_table(cls, value: object) -> object:
         """Reject mappings other than dictionaries: a Dr.Jit optimizer is a mapping, but holds none of the keys."""
         if isinstance(value, Mapping) and not isinstance(value, dict):
             raise PydanticCustomError("table_type", "input should be a dictionary")

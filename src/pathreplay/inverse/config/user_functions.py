@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +19,8 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.scenes.descriptions import one_line
+
+T = TypeVar("T")
 
 DEEPEST = 8
 """Deepest nesting of lists in a return value."""
@@ -29,12 +32,12 @@ class Imported:
 
     kind: str
     name: str
-    function: Callable[..., Any]
+    function: Callable[..., object]
 
     def __str__(self) -> str:
         return f"{self.kind} '{self.name}'"
 
-    def __call__(self, convert: Callable[[Any], Any], *args: Any) -> Any:
+    def __call__(self, convert: Callable[[object], T], *args: object) -> T:
         """Call the function and return its value, converted by ``convert``.
 
         Raises PathreplayError if either of them raises, or if the return value is not numeric.
@@ -57,9 +60,9 @@ class Modules:
     A module is executed once. ``given`` maps names to callables, which take precedence over modules.
     """
 
-    def __init__(self, base: Path | None = None, given: Mapping[str, Callable[..., Any]] | None = None) -> None:
+    def __init__(self, base: Path | None = None, given: Mapping[str, Callable[..., object]] | None = None) -> None:
         self._base, self._given = base, dict(given or {})
-        self._known: dict[str, Any] = {}
+        self._known: dict[str, ModuleType] = {}
 
     def function(self, kind: str, name: str, takes: str) -> Imported:
         """Import a function; this executes its module on first use.
@@ -89,7 +92,7 @@ class Modules:
             raise PathreplayError(f"{kind} '{name}' is not a function of {takes}, but {shown(imported)}; name another")
         return Imported(kind, name, imported)
 
-    def _loaded(self, name: str) -> Any:
+    def _loaded(self, name: str) -> ModuleType:
         """Execute a module of the folder ``base``, or import an installed one.
 
         A module of the folder is always executed, since another folder may have a module of the same name. During the
@@ -137,7 +140,7 @@ def _why(error: BaseException) -> str:
     return one_line(error) or type(error).__name__
 
 
-def _no_numbers(value: Any, depth: int = 0) -> str:
+def _no_numbers(value: object, depth: int = 0) -> str:
     """Describe a value that Dr.Jit cannot convert to an array; return "" if it can.
 
     The check is needed because Dr.Jit's constructors iterate over any sequence. The elements of a string are strings

@@ -13,7 +13,6 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -25,6 +24,7 @@ from pathreplay.inverse.dataset.photos import Photo
 from pathreplay.inverse.dataset.transforms_json import photos_of_json
 from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.platform.files import file_names, file_problem
+from pathreplay.types import SceneDict
 
 STRAIGHT = 1e-3
 """Tolerance on the orthonormality of the axes of a camera."""
@@ -38,7 +38,7 @@ class Shot:
 
     image: Path
     mask: Path | None
-    camera: dict[str, Any]
+    camera: SceneDict
     """Mitsuba dictionary of a pinhole camera."""
     lens: Lens | None = None
     """Distortion to remove from the image; None for a pinhole camera."""
@@ -107,7 +107,7 @@ def _names(files: list[str]) -> list[str]:
     return list(file_names(words).values())
 
 
-def _camera(photo: Photo, size: tuple[int, int], width: int | None, pixel_format: str) -> dict[str, Any]:
+def _camera(photo: Photo, size: tuple[int, int], width: int | None, pixel_format: str) -> SceneDict:
     """Make the Mitsuba dictionary of the pinhole camera of a photo."""
     lens, axes = photo.lens, photo.place[:3, :3]
     if (

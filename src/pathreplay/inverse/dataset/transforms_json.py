@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
@@ -17,6 +17,7 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.dataset.photos import Photo
 from pathreplay.inverse.dataset.undistortion import OFF, Lens
 from pathreplay.platform.files import MISSING, file_problem
+from pathreplay.types import Json
 
 MOST_BYTES = 64 * 2**20
 ENDINGS = (".png", ".jpg", ".jpeg", ".exr")
@@ -110,7 +111,7 @@ def _picture(name: str, path: Path) -> Path:
     return image
 
 
-def _lens(where: str, table: dict[str, Any], size: tuple[int, int]) -> Lens:
+def _lens(where: str, table: Json, size: tuple[int, int]) -> Lens:
     if (model := table["camera_model"]) is not None and model not in MODELS:
         raise PathreplayError(
             f"{where} has the unsupported camera_model {shown(model)}; undistort its image to a PINHOLE camera first"

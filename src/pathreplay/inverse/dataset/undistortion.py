@@ -12,12 +12,14 @@ and the fisheye model multiplies both by θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ +
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.ndimage
+from numpy.typing import NDArray
 
 from pathreplay.inverse.images.io import Image
+
+Plane = NDArray[np.float64]
 
 OFF = 0.5
 """Largest error in pixels at the image border that is accepted for treating pixels as square."""
@@ -53,7 +55,7 @@ class Lens:
             return "a fisheye lens"
         return "a distorting lens" if any(self.radial) or any(self.tangential) else "pixels that are not square"
 
-    def bent(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+    def bent(self, x: Plane, y: Plane) -> tuple[Plane, Plane, NDArray[np.bool_]]:
         """Distort points of the plane z = 1.
 
         Returns:
@@ -67,7 +69,7 @@ class Lens:
         x_bent = x * f + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2)
         return x_bent, y * f + 2 * p2 * x * y + p1 * (r**2 + 2 * y**2), unfolded
 
-    def _stretch(self, r: Any) -> Any:
+    def _stretch(self, r: Plane) -> Plane:
         k = self.radial
         with np.errstate(all="ignore"):  # non-finite values count as not monotonic
             if self.fisheye:

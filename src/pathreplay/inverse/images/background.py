@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -28,7 +27,14 @@ def background(scene: mi.Scene, sensor: int) -> Image:
     """
 
     class Sky(mi.SamplingIntegrator):  # defined here, because the base class depends on the variant
-        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.RayDifferential3f,
+            medium: mi.Medium | None = None,
+            active: mi.Bool | bool = True,
+        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
             si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
             si.wi, si.wavelengths = -ray.d, ray.wavelengths
             environment = scene.environment()

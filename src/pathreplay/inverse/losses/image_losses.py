@@ -6,7 +6,7 @@ Rendering noise biases their gradients; more samples per pixel reduce the bias.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -16,11 +16,14 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.metrics import C1, C2, CUT, SIGMA
 from pathreplay.scenes.descriptions import one_line
 
+if TYPE_CHECKING:
+    import torch
+
 # An image with less than this fraction of the target's mean square counts as black: its scale factor tends to 0.
 _BLACK = 1e-9
 
 
-def scale_invariant(image: mi.TensorXf, target: mi.TensorXf, weight: Any = None) -> mi.TensorXf:
+def scale_invariant(image: mi.TensorXf, target: mi.TensorXf, weight: mi.TensorXf | None = None) -> mi.TensorXf:
     """Compute (s I - T)² with the least-squares scale s = Σ w I T / Σ w I² of the whole image.
 
     The scale s is detached: at the minimum, the derivative of the loss by s is zero. For a black image, s is 0.
@@ -95,7 +98,7 @@ def lpips(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
     network = _network()
 
     @dr.wrap(source="drjit", target="torch")
-    def distance(a: Any, b: Any) -> Any:
+    def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         a, b = (2 * x.permute(2, 0, 1)[None] - 1 for x in (a, b))
         return network.to(a.device)(a, b)[0].permute(1, 2, 0).contiguous()
 
@@ -106,7 +109,7 @@ def lpips(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 @lru_cache(maxsize=1)
-def _network() -> Any:
+def _network() -> torch.nn.Module:
     try:
         import lpips as module
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +21,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.user_functions import Imported, Modules
 from pathreplay.inverse.losses.image_losses import lpips, scale_invariant, ssim
 
-Loss = Callable[..., Any]
+Loss: TypeAlias = "Callable[..., mi.TensorXf]"
 """loss(image, target), on tensors of shape (height, width, channels); returns a tensor of that shape or a scalar."""
 
 # Radiance that bounds the denominators of relative losses: about 1 % of display white.
@@ -84,7 +84,7 @@ LOSSES: dict[str, Loss] = {
 }
 
 
-def mean_loss(loss: Loss, image: Any, target: Any, weight: Any = None) -> mi.TensorXf:
+def mean_loss(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weight: mi.TensorXf | None = None) -> mi.TensorXf:
     """Average a loss over pixels and channels.
 
     Args:
@@ -127,7 +127,7 @@ class Own:
     def __str__(self) -> str:
         return str(self.function)
 
-    def __call__(self, image: Any, target: Any) -> Any:
+    def __call__(self, image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
         value = self.function(mi.TensorXf, image, target)
         if value.shape not in (image.shape, (), (1,)):
             raise PathreplayError(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gc
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -178,13 +178,13 @@ def _differentiate(
             state = integrator.gradient_pass(apart, dr.grad(image), state)
     by_factor = None
     if factor is not None:
-        other: Any = mi.sample_tea_32(mi.UInt32(view.seed), mi.UInt32(int(Stream.SECOND_IMAGE)))[0]
+        other = mi.sample_tea_32(mi.UInt32(view.seed), mi.UInt32(int(Stream.SECOND_IMAGE)))[0]
         again = integrator.image_pass(replace(view, seed=other), state)
         by_factor = derivative(loss.loss, image, again, factor, target.target, target.weight) * share
     return ViewResult(dr.detach(value), state, by_factor)
 
 
-def _times(tensor: Any, factor: Any) -> Any:
+def _times(tensor: mi.TensorXf, factor: mi.TensorXf | None) -> mi.TensorXf:
     return tensor if factor is None else tensor * factor
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import prod
-from typing import Any, Protocol
+from typing import Protocol
 
 import drjit as dr
 import drjit.opt
@@ -153,7 +153,7 @@ class DrJitOptimiser:
         """See `Optimiser`."""
         return {}
 
-    def _remembered(self, name: str, part: drjit.opt.Optimizer) -> dict[str, Any]:
+    def _remembered(self, name: str, part: drjit.opt.Optimizer) -> dict[str, dr.ArrayBase]:
         """Return the state of a piece as Dr.Jit arrays, by kind."""
         kept = part.state[name][3]
         arrays = kept[1:] if self._moments else (kept,)
@@ -219,13 +219,13 @@ def _together(pieces: Mapping[str, tuple[str, slice]], most: int) -> Iterator[li
         yield group
 
 
-class WhenAsked(Mapping[str, Any]):
+class WhenAsked(Mapping[str, Array]):
     """A read-only mapping whose arrays are computed on each access and not cached."""
 
-    def __init__(self, makers: Mapping[str, Callable[[], Any]]) -> None:
+    def __init__(self, makers: Mapping[str, Callable[[], Array]]) -> None:
         self._makers = dict(makers)
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> Array:
         return self._makers[name]()
 
     def __iter__(self) -> Iterator[str]:

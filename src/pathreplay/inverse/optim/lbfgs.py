@@ -11,7 +11,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -28,7 +27,7 @@ MOST = 1000
 ENDLESS = 10**9
 
 Vector = NDArray[np.float64]
-Search = Callable[..., Any]
+Search = Callable[..., object]
 """search(function, start, jac=True, bounds=...) -> anything; see `LineSearch`."""
 _START, _SCALE, _LOSSES, _GRADIENTS, _NEXT = (f"search:{n}" for n in ("start", "scale", "losses", "gradients", "next"))
 
@@ -136,7 +135,7 @@ class LineSearch:
         steps = dict.fromkeys(self._shapes, len(self._losses))
         if not self._losses:
             return State(steps, {})
-        arrays: dict[str, Any] = {
+        arrays: dict[str, NDArray[np.floating]] = {
             _START: self._start,
             _SCALE: self._scale,
             _LOSSES: np.array(self._losses, np.float64),
@@ -173,8 +172,12 @@ class LineSearch:
 
 
 def _of_scipy(
-    function: Callable[[Vector], tuple[float, Vector]], start: Vector, history_size: int, tolerance: float, **more: Any
-) -> Any:
+    function: Callable[[Vector], tuple[float, Vector]],
+    start: Vector,
+    history_size: int,
+    tolerance: float,
+    **more: object,
+) -> object:
     """Run SciPy's L-BFGS-B."""
     options = {"maxcor": history_size, "ftol": tolerance, "gtol": 0.0, "maxfun": ENDLESS, "maxiter": ENDLESS}
     return scipy.optimize.minimize(function, start, method="L-BFGS-B", options=options, **more)

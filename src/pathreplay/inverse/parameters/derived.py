@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +20,7 @@ from pathreplay.inverse.config.user_functions import Imported, Modules
 from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.values import Array, seen
 from pathreplay.inverse.parameters.variables import Variable
-from pathreplay.scenes.parameters import is_transform
+from pathreplay.scenes.parameters import SceneValue, is_transform
 from pathreplay.scenes.stored import Form, form_of
 
 
@@ -33,13 +32,13 @@ class Derived:
     function: Imported
     of: tuple[str, ...]
     """Keys of the variables that the function takes after p₀."""
-    first: Any
+    first: SceneValue
     """The decoded value p₀ in the scene; detached."""
     form: Form
     """Conversion between the decoded value and the value that Mitsuba stores."""
     truth: Array | None = None
 
-    def value(self, variables: Mapping[str, Any]) -> Any:
+    def value(self, variables: Mapping[str, SceneValue]) -> SceneValue:
         """Compute the decoded value p; derivatives propagate to the variables.
 
         Args:
@@ -61,7 +60,7 @@ class Derived:
             )
         return p
 
-    def require_finite(self, variables: Mapping[str, Any]) -> Any:
+    def require_finite(self, variables: Mapping[str, SceneValue]) -> SceneValue:
         """Return the value. Raises PathreplayError if it is NaN or infinite."""
         p = self.value(variables)
         if not dr.all(dr.isfinite(dr.ravel(p.matrix if is_transform(p) else p)))[0]:
@@ -71,7 +70,7 @@ class Derived:
         return p
 
 
-def _matrix(kind: Any, value: Any) -> Any:
+def _matrix(kind: type, value: object) -> object:
     """Convert a value to an argument of the constructor of a transform."""
     return value if isinstance(value, kind) else type(kind().matrix)(value)
 
@@ -124,7 +123,7 @@ def _at_level(variable: Variable, k: int) -> Array:
     return resampled(variable.start, variable.levels.shapes[min(k, len(variable.levels.shapes) - 1)])
 
 
-def _require(derived: Derived, variables: dict[str, Any]) -> None:
+def _require(derived: Derived, variables: dict[str, SceneValue]) -> None:
     """Raise PathreplayError unless the value is finite and depends on all of its variables."""
     derived.require_finite(variables)
     for name, variable in variables.items():

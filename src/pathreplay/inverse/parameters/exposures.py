@@ -8,9 +8,9 @@ uses two independent renderings A and B: f'(e A, T) B.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
@@ -76,7 +76,9 @@ def exposed(values: Arrays, view: int, picture: Image) -> Image:
     return picture if factor is None else picture * factor
 
 
-def derivative(loss: Loss, a: Any, b: Any, factor: Any, target: Any, weight: Any) -> Any:
+def derivative(
+    loss: Loss, a: mi.TensorXf, b: mi.TensorXf, factor: mi.TensorXf, target: mi.TensorXf, weight: mi.TensorXf | None
+) -> mi.TensorXf:
     """Estimate the derivative of the mean loss by the logarithm of the factor of each channel.
 
     Args:

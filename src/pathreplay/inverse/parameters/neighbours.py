@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
 
-def neighbours(positions: NDArray[np.floating], faces: NDArray[np.integer]) -> tuple[NDArray[np.integer], Any]:
+def neighbours(
+    positions: NDArray[np.floating], faces: NDArray[np.integer]
+) -> tuple[NDArray[np.integer], scipy.sparse.csr_matrix]:
     """Merge vertices with equal positions and compute the adjacency matrix of the merged vertices.
 
     Mesh files duplicate vertices where texture coordinates or normals differ.

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.parameter_options import PARTS, PoseKind
-from pathreplay.scenes.parameters import get_array, is_transform
+from pathreplay.scenes.parameters import SceneValue, get_array, is_transform
 
 PART_NAMES = (":translation", ":rotation")
 """Suffixes of the keys of the variables of a pose."""
@@ -38,7 +38,7 @@ class Pose:
 
     key: str
     kind: PoseKind
-    base: Any
+    base: SceneValue
     """M₀ or the vertex positions in the scene; detached."""
     pivot: tuple[float, float, float]
     distance: float | None
@@ -55,7 +55,7 @@ class Pose:
         """Keys of the variables that the pose is computed from."""
         return tuple(self.parts().values())
 
-    def value(self, variables: Mapping[str, Any]) -> Any:
+    def value(self, variables: Mapping[str, Any]) -> SceneValue:
         """Compute the value of the scene parameter; derivatives propagate to the variables.
 
         Args:
@@ -115,7 +115,7 @@ def error_names(key: str) -> tuple[str, str]:
     return f"{key}:position", f"{key}:degrees"
 
 
-def make_pose(key: str, value: Any, kind: PoseKind, pivot: list[float] | None, distance: float | None) -> Pose:
+def make_pose(key: str, value: SceneValue, kind: PoseKind, pivot: list[float] | None, distance: float | None) -> Pose:
     """Make a pose for the parameter ``key``.
 
     Args:
@@ -143,7 +143,7 @@ def make_pose(key: str, value: Any, kind: PoseKind, pivot: list[float] | None, d
     return Pose(key, kind, type(value)(dr.detach(value)), (x, y, z), distance, None)
 
 
-def rotation_matrix(r: Any) -> Any:
+def rotation_matrix(r: mi.Vector3f) -> mi.Matrix3f:
     """Compute R(r) for a rotation vector in radians; the derivative is finite at r = 0, too."""
     θ2 = dr.squared_norm(r)
     small = θ2 < _SMALL

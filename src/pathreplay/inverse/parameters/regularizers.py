@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -124,7 +123,7 @@ class Own:
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
         """See `Term`. Raises PathreplayError if the function fails, or its value or gradient is not finite."""
-        v: Any = mi.TensorXf(np.ascontiguousarray(values))
+        v = mi.TensorXf(np.ascontiguousarray(values))
         dr.enable_grad(v)
         value = self.function(_flat, mi.TensorXf(v))  # a copy, which the function may modify
         if dr.width(value) != 1:
@@ -185,7 +184,7 @@ def _differentiable(term: Term, values: mi.TensorXf) -> mi.TensorXf:
     return linear + value
 
 
-def _flat(value: Any) -> Any:
+def _flat(value: object) -> mi.Float:
     return mi.TensorXf(value).array
 
 

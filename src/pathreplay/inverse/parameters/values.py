@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -13,7 +12,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.parameter_options import ImageValue, Value
 from pathreplay.inverse.images.io import Image, find_image, read_image, resized, with_channels
 from pathreplay.inverse.parameters.grids import Array, resampled
-from pathreplay.scenes.parameters import get_array, is_transform
+from pathreplay.scenes.parameters import SceneValue, get_array, is_transform
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.volume_files import load_volume
 
@@ -21,7 +20,7 @@ Arrays = Mapping[str, Array]
 """Arrays by key of the variable."""
 
 
-def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
+def make_value(key: str, like: SceneValue, value: Value, base: Path) -> Array:
     """Convert a value of a job to an array.
 
     A number fills all entries. A list is a colour, repeated over a texture, or all entries of a flat array. An image is
@@ -69,7 +68,7 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
     return resized(adapted, current.shape[0], current.shape[1], crop=picture.fit == "crop")
 
 
-def seen(params: mi.SceneParameters, key: str) -> Any:
+def seen(params: mi.SceneParameters, key: str) -> SceneValue:
     """Return the decoded value of a scene parameter, which is what jobs take, optimise and save (see `Form`)."""
     return form_of(params, key).see(params[key])
 

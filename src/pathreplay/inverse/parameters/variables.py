@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +25,7 @@ from pathreplay.inverse.parameters.regularizers import Laplacian, Own, Penalty, 
 from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
 from pathreplay.inverse.parameters.values import Array, make_value, require_finite_array, seen
 from pathreplay.scenes import parameters
+from pathreplay.scenes.parameters import SceneValue
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
 
 RESERVED = frozenset({EXPOSURE, "__metadata__"})
@@ -41,7 +41,7 @@ class Variable:
     """
 
     key: str
-    like: Any
+    like: SceneValue
     """A Dr.Jit value of the type and shape of the variable."""
     bounds: tuple[float, float]
     """Lower and upper bound, enforced by projection after each step."""
@@ -59,7 +59,7 @@ class Variable:
     form: Form = AS_STORED
     """Conversion between decoded values and the values that Mitsuba stores."""
 
-    def held(self, values: Array) -> Any:
+    def held(self, values: Array) -> dr.ArrayBase:
         """Convert an array to Dr.Jit; the resolution of a grid may differ from its initial one."""
         return type(self.like)(values) if dr.is_tensor_v(self.like) else parameters.to_value(self.like, values)
 
@@ -229,7 +229,7 @@ def _penalty(
     return Penalty(tuple(terms)) if terms else None
 
 
-def _numbers(key: str, shape: list[int]) -> Any:
+def _numbers(key: str, shape: list[int]) -> mi.TensorXf:
     """Make a literal zero tensor. Raises PathreplayError if an array of its size does not fit into memory."""
     parameter_limits.require_values({key: prod(shape)})
     return dr.zeros(mi.TensorXf, shape)
@@ -246,7 +246,7 @@ def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> L
     return make_levels(start.shape, entry.resolutions, refine_at)
 
 
-def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path, given: Array | None) -> Array:
+def _start(key: str, like: SceneValue, form: Form, entry: Parameter, base: Path, given: Array | None) -> Array:
     if not dr.is_array_v(like):
         raise PathreplayError(
             f"Parameter '{key}' is a matrix, and steps of its 16 entries would not keep it rigid; set "

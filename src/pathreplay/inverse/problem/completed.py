@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
 from pathreplay.integrators.path_limits import Limits, read_limits
@@ -12,6 +10,7 @@ from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.tables import Plugin
 from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.types import Json
 
 SHOWN = {"max_depth": "the length of paths", "hide_emitters": "whether emitters are visible"}
 """Options that change the expected image, and what each determines."""
@@ -47,10 +46,10 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
     return config.model_copy(update={"target": config.target.model_copy(update={"integrator": plugin})}), ()
 
 
-def _options(own: Any) -> dict[str, Any]:
+def _options(own: mi.Integrator | None) -> Json:
     """Return the options of `pathreplay` that the scene's integrator implies; empty if it has none or no limits."""
     limits = None if own is None else read_limits(own)
-    if limits is None:
+    if own is None or limits is None:
         return {}
     if options := stateful(own).options():
         return vars(limits) | options

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -41,7 +40,7 @@ def require_finite_loss(
         weight: weights of the pixels, or None.
         picture: rendered image; None for a black one.
     """
-    image: Any = mi.TensorXf(np.zeros_like(target) if picture is None else picture)
+    image = mi.TensorXf(np.zeros_like(target) if picture is None else picture)
     dr.enable_grad(image)
     value = mean_loss(loss, image, mi.TensorXf(target), None if weight is None else mi.TensorXf(weight))
     if not dr.grad_enabled(value):

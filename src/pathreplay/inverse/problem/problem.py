@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -58,15 +57,16 @@ from pathreplay.platform.traversal import traversed
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import errors_as, load_integrator
 from pathreplay.scenes.loading import load_scene_for
+from pathreplay.scenes.parameters import SceneValue
 
 
 class VariableCache:
     """Cache of the last values that were converted to Dr.Jit, so that only one copy exists."""
 
     def __init__(self) -> None:
-        self._known: dict[str, tuple[weakref.ref[Array], Any]] = {}
+        self._known: dict[str, tuple[weakref.ref[Array], dr.ArrayBase]] = {}
 
-    def variables(self, problem: Problem, values: Arrays) -> dict[str, Any]:
+    def variables(self, problem: Problem, values: Arrays) -> dict[str, dr.ArrayBase]:
         """Convert values as `variables_of`, without gradients; reuse the arrays if the values are the same objects."""
         keys = [v.key for v in problem.variables]
         if any(key not in self._known or self._known[key][0]() is not values[key] for key in keys):
@@ -142,7 +142,7 @@ class Problem:
         return {n: view for n, view in enumerate(self.views) if not view.is_test}
 
 
-def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
+def variables_of(problem: Problem, values: Arrays) -> dict[str, dr.ArrayBase]:
     """Convert the decoded values of the variables to evaluated Dr.Jit arrays that own their memory."""
     # Dr.Jit would wrap NumPy's memory, whose alignment varies and would force frozen functions to record again.
     one = dr.opaque(mi.Float, 1)
@@ -151,7 +151,7 @@ def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
     return variables
 
 
-def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, Any]:
+def scene_values(problem: Problem, variables: Mapping[str, dr.ArrayBase]) -> dict[str, SceneValue]:
     """Compute the scene parameters in the form that Mitsuba stores; derivatives propagate to the variables.
 
     Args:
@@ -161,7 +161,9 @@ def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, An
     Returns:
         Values of scene parameters, by key.
     """
-    plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key in problem.params}
+    plain: dict[str, SceneValue] = {
+        v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key in problem.params
+    }
     derived = {entry.key: entry.form.store(entry.value(variables)) for entry in problem.derived}
     return plain | derived | {pose.key: pose.value(variables) for pose in problem.poses}
 
@@ -211,7 +213,7 @@ class InMemory:
 
     scene: mi.Scene | None = None
     integrator: mi.Integrator | None = None
-    functions: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
+    functions: Mapping[str, Callable[..., object]] = field(default_factory=dict)
     """Callables, by their names in the job."""
     starts: Mapping[str, Array] = field(default_factory=dict)
     """Initial values by key of the parameter, in place of its ``initial``."""
