@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.parameters.values import Array
+from pathreplay.types import Json
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Parameter:
         shape: shape of a parameter that is not part of the scene, from which others are `Derived`.
     """
 
-    initial: Any = None
+    initial: object = None
     bounds: tuple[float | None, float | None] = (None, None)
     learning_rate: float | None = None
     parameterization: str | None = None
@@ -54,7 +55,7 @@ class Parameter:
     total_variation: float | None = None
     l2_to_initial: float | None = None
     laplacian_weight: float | None = None
-    regularizer: Callable[[Any], Any] | str | None = None
+    regularizer: Callable[[mi.TensorXf], object] | str | None = None
     shape: Sequence[int] | None = None
 
 
@@ -62,7 +63,7 @@ class Parameter:
 class Derived:
     """A scene parameter computed from parameters: ``function(value in the scene, *values of the parameters in of)``."""
 
-    function: Callable[..., Any] | str
+    function: Callable[..., object] | str
     of: Sequence[str]
 
 
@@ -79,8 +80,8 @@ class View:
     """
 
     sensor: int | str = 0
-    target: Any = None
-    weight: Any = None
+    target: object = None
+    weight: object = None
     share: float = 1.0
     test: bool = False
 
@@ -107,10 +108,10 @@ class Objects:
     """Functions and arrays of a problem, by the names that represent them in the tables of a job."""
 
     def __init__(self) -> None:
-        self.functions: dict[str, Callable[..., Any]] = {}
+        self.functions: dict[str, Callable[..., object]] = {}
         self.starts: dict[str, Array] = {}
 
-    def named(self, function: Callable[..., Any] | str) -> str:
+    def named(self, function: Callable[..., object] | str) -> str:
         """Return the name that represents a function; strings are returned unchanged."""
         if isinstance(function, str):
             return function
@@ -122,11 +123,11 @@ class Objects:
         self.functions[name] = function
         return name
 
-    def tables(self, wanted: Mapping[str, Parameter | None]) -> list[dict[str, Any]]:
+    def tables(self, wanted: Mapping[str, Parameter | None]) -> list[Json]:
         """Translate parameters to tables. Raises PathreplayError if the initial value of a pose is an array."""
         return [self._table(key, entry or Parameter()) for key, entry in wanted.items()]
 
-    def _table(self, key: str, entry: Parameter) -> dict[str, Any]:
+    def _table(self, key: str, entry: Parameter) -> Json:
         lower, upper = entry.bounds
         table = {"key": key, "lower": lower, "upper": upper}
         table |= {each.name: getattr(entry, each.name) for each in fields(Parameter) if each.name != "bounds"}
@@ -142,14 +143,14 @@ class Objects:
                 )
         return {name: _plain(value) for name, value in table.items() if value is not None}
 
-    def made(self, derived: Mapping[str, Derived]) -> list[dict[str, Any]]:
+    def made(self, derived: Mapping[str, Derived]) -> list[Json]:
         """Translate derived parameters to tables."""
         return [
             {"key": key, "function": self.named(each.function), "of": list(each.of)} for key, each in derived.items()
         ]
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """Convert arrays and NumPy scalars to lists and numbers."""
     if isinstance(value, (str, Mapping)):
         return value

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 
@@ -67,20 +66,20 @@ class Result:
 
 def minimize(  # noqa: PLR0913 (of which most are keywords)
     problem: Problem,
-    optimizer: str | Mapping[str, Any] | Stepper | Any = None,
+    optimizer: str | Mapping[str, object] | Stepper | object = None,
     steps: int | None = None,
     *,
-    callbacks: Iterable[Callable[[Iteration], Any]] = (),
+    callbacks: Iterable[Callable[[Iteration], object]] = (),
     progress: bool = True,
     output: str | Path | None = None,
     resume: bool = False,
-    stages: Sequence[Mapping[str, Any]] | None = None,
+    stages: Sequence[Mapping[str, object]] | None = None,
     learning_rate_schedule: str | None = None,
     final_learning_rate_ratio: float | None = None,
     warmup_steps: int | None = None,
     view_batch_size: int | None = None,
     pixel_batch_size: int | None = None,
-    **settings: Any,
+    **settings: object,
 ) -> Result:
     """Minimise a problem from its initial values.
 
@@ -129,8 +128,8 @@ def minimize(  # noqa: PLR0913 (of which most are keywords)
 def _minimized(
     problem: Problem,
     built: inner.Problem,
-    own: Any,
-    callbacks: Sequence[Callable[[Iteration], Any]],
+    own: object,
+    callbacks: Sequence[Callable[[Iteration], object]],
     progress: bool,
     output: Path | None,
     resume: bool,
@@ -172,7 +171,7 @@ def _minimized(
     return Result(found, run.history, stop.by or run.optimiser.finished or None, problem, folder)
 
 
-def _run(problem: Problem, built: inner.Problem, own: Any, stack: ExitStack, bar: Progress | NotebookPanel) -> Run:
+def _run(problem: Problem, built: inner.Problem, own: object, stack: ExitStack, bar: Progress | NotebookPanel) -> Run:
     """Create the run, with the user's optimizer if there is one."""
     config = built.config
     pool = stack.enter_context(crew_of(config, problem.base, built, bar.remark, bar.status))

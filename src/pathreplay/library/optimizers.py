@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Protocol
 
 import drjit as dr
@@ -16,6 +16,7 @@ from pathreplay.inverse.parameters.pose import PART_NAMES
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.scenes.parameters import resolve_keys
+from pathreplay.types import Json
 
 
 class Stepper(Protocol):
@@ -84,14 +85,14 @@ class OfMitsuba:
         self._steps = dict(state.steps)
 
 
-def _leaves(tree: Any) -> list[Any]:
+def _leaves(tree: object) -> list[dr.ArrayBase]:
     """Return the arrays of nested tuples, in order."""
     if isinstance(tree, tuple):
         return [leaf for branch in tree for leaf in _leaves(branch)]
     return [tree] if dr.is_array_v(tree) else []
 
 
-def _with_leaves(tree: Any, leaves: Any) -> Any:
+def _with_leaves(tree: object, leaves: Iterator[dr.ArrayBase]) -> Any:
     """Replace the arrays of nested tuples."""
     if isinstance(tree, tuple):
         return tuple(_with_leaves(branch, leaves) for branch in tree)
@@ -104,7 +105,7 @@ class OfUser:
     finished = ""
 
     def __init__(self, stepper: Stepper, values: Arrays) -> None:
-        self._stepper: Any = stepper
+        self._stepper: Any = stepper  # which may have a state
         self._steps = dict.fromkeys(values, 0)
 
     def step(
@@ -166,7 +167,7 @@ def _rated(problem: Problem) -> set[str]:
     return {key for key, owner in owners.items() if owner in rated}
 
 
-def options_of(optimizer: Any) -> tuple[dict[str, Any] | None, Any]:
+def options_of(optimizer: object) -> tuple[Json | None, object]:
     """Return the options of a built-in optimizer, and a foreign optimizer object or search function.
 
     Raises PathreplayError if it is neither.

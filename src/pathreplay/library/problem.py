@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +28,7 @@ from pathreplay.platform.device import require_order
 from pathreplay.platform.traversal import traversed
 from pathreplay.runs.run_folder import IN_MEMORY
 from pathreplay.scenes.loading import load_scene_for
+from pathreplay.types import Json
 
 MOST_ITERATIONS = 10**6
 """Iterations of a problem that is not part of a run: larger than any iteration at which a grid is refined."""
@@ -67,32 +67,32 @@ class Problem:
 
     def __init__(  # noqa: PLR0913 (of which most are keywords)
         self,
-        scene: mi.Scene | Mapping[str, Any] | str | Path,
+        scene: mi.Scene | Mapping[str, object] | str | Path,
         parameters: Mapping[str, Parameter | None] | Sequence[str] | str,
         views: View | Sequence[View],
         *,
-        loss: str | Callable[[Any, Any], Any] = "l2",
-        integrator: Mapping[str, Any] | mi.Integrator | None = None,
+        loss: str | Callable[[mi.TensorXf, mi.TensorXf], mi.TensorXf] = "l2",
+        integrator: Mapping[str, object] | mi.Integrator | None = None,
         derived: Mapping[str, Derived] | None = None,
         spp: int = 16,
         learning_rate: float = 0.02,
         seed: int = 0,
         deterministic: bool = False,
-        **settings: Any,
+        **settings: object,
     ) -> None:
         settings |= {"spp": spp, "learning_rate": learning_rate, "seed": seed, "deterministic": deterministic}
         self._build(settings, Path.cwd(), scene, parameters, views, loss, integrator, derived or {})
 
     def _build(
         self,
-        job: dict[str, Any],
+        job: Json,
         base: Path,
-        scene: Any = None,
-        parameters: Any = None,
-        views: Any = None,
-        loss: Any = None,
-        integrator: Any = None,
-        derived: Any = None,
+        scene: mi.Scene | Mapping[str, object] | str | Path | None = None,
+        parameters: Mapping[str, Parameter | None] | Sequence[str] | str | None = None,
+        views: View | Sequence[View] | None = None,
+        loss: str | Callable[[mi.TensorXf, mi.TensorXf], mi.TensorXf] | None = None,
+        integrator: Mapping[str, object] | mi.Integrator | None = None,
+        derived: Mapping[str, Derived] | None = None,
     ) -> None:
         """Replace parts of a job by the given objects, and build the problem."""
         self.base, self.job, objects = base, job, Objects()
@@ -110,7 +110,9 @@ class Problem:
             job["loss"] = next((name for name, each in LOSSES.items() if each is loss), None) or objects.named(loss)
         own_integrator = None if isinstance(integrator, Mapping) else integrator
         if integrator is not None:
-            job["integrator"] = {"type": type(integrator).__name__} if own_integrator else dict(integrator)
+            job["integrator"] = (
+                dict(integrator) if isinstance(integrator, Mapping) else {"type": type(integrator).__name__}
+            )
         if isinstance(scene, (str, Path)):
             job["scene"], scene = str(scene), None
         own_scene, targets = None, None
@@ -203,7 +205,7 @@ class Problem:
             for key, start in starts.items()
         }
 
-    def configured(self, changes: Mapping[str, Any], name: str) -> inner.Problem:
+    def configured(self, changes: Mapping[str, object], name: str) -> inner.Problem:
         """Return the problem with changed settings.
 
         Args:
@@ -241,9 +243,7 @@ class Problem:
         params.update()
 
 
-def run_settings(
-    name: str, steps: int | None, options: dict[str, Any] | None, settings: Mapping[str, Any]
-) -> dict[str, Any]:
+def run_settings(name: str, steps: int | None, options: Json | None, settings: Mapping[str, object]) -> Json:
     """Collect the settings of a run as keys of a job; None stands for the default. ``name`` starts error messages."""
     if "iterations" in settings:
         raise PathreplayError(f"{name}: 'iterations' is called 'steps' here")
@@ -260,7 +260,7 @@ def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
     return array if resized else array.reshape(wanted)
 
 
-def _loaded(scene: Any, job: Mapping[str, Any], base: Path) -> tuple[mi.Scene, tuple[str, ...]]:
+def _loaded(scene: object, job: Json, base: Path) -> tuple[mi.Scene, tuple[str, ...]]:
     """Load a scene, with differentiable plugins for the unknown parameters (see `load_scene_for`), and notes."""
     if isinstance(scene, mi.Scene):
         return scene, ()
@@ -275,7 +275,7 @@ def _loaded(scene: Any, job: Mapping[str, Any], base: Path) -> tuple[mi.Scene, t
     return load_scene_for(dict(scene) if isinstance(scene, Mapping) else scene, wanted, base, **given)
 
 
-def _moved(job: dict[str, Any], scene: mi.Scene, views: Sequence[View] | None) -> Targets | None:
+def _moved(job: Json, scene: mi.Scene, views: Sequence[View] | None) -> Targets | None:
     """Change a job for a scene in memory, and for targets in memory if there are ``views``; returns these targets."""
     said, job["scene"] = job.get("scene"), IN_MEMORY
     if views is None:
@@ -294,14 +294,14 @@ def _moved(job: dict[str, Any], scene: mi.Scene, views: Sequence[View] | None) -
 def load_job(
     path: str | Path,
     *,
-    scene: mi.Scene | Mapping[str, Any] | str | Path | None = None,
+    scene: mi.Scene | Mapping[str, object] | str | Path | None = None,
     parameters: Mapping[str, Parameter | None] | Sequence[str] | str | None = None,
     views: View | Sequence[View] | None = None,
-    loss: str | Callable[[Any, Any], Any] | None = None,
-    integrator: Mapping[str, Any] | mi.Integrator | None = None,
+    loss: str | Callable[[mi.TensorXf, mi.TensorXf], mi.TensorXf] | None = None,
+    integrator: Mapping[str, object] | mi.Integrator | None = None,
     derived: Mapping[str, Derived] | None = None,
     define: Sequence[str] = (),
-    **settings: Any,
+    **settings: object,
 ) -> Problem:
     """Create a problem from the file of a job, with changes.
 

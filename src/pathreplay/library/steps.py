@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -24,7 +23,7 @@ from pathreplay.library.problem import Problem, run_settings
 class _Task:
     """Settings and kernels shared by the states of one optimisation, and an optimiser synchronised with one of them."""
 
-    def __init__(self, changes: Mapping[str, Any]) -> None:
+    def __init__(self, changes: Mapping[str, object]) -> None:
         self._changes = changes
         self.own: adaptive.Optimiser | None = None
         """Optimiser object of the user, if any."""
@@ -78,9 +77,9 @@ class State:
 
 def init(
     problem: Problem,
-    optimizer: str | Mapping[str, Any] | Stepper | Any = None,
+    optimizer: str | Mapping[str, object] | Stepper | object = None,
     steps: int | None = None,
-    **settings: Any,
+    **settings: object,
 ) -> State:
     """Create the initial state of an optimisation.
 

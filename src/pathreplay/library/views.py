@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -53,7 +52,7 @@ def targets_of(scene: mi.Scene, views: Mapping[str, View]) -> Targets:
     return Targets(images, weights)
 
 
-def _pixels(what: str, value: Any) -> Image:
+def _pixels(what: str, value: object) -> Image:
     """Convert an image to linear pixels (height, width, channels). Raises PathreplayError if this is impossible."""
     if isinstance(value, (str, Path)):
         return read_image(find_image(str(value), Path()))
