@@ -36,7 +36,7 @@ class _Ended(BaseException):
 class _Commands(typer.core.TyperGroup):
     """Passes a KeyboardInterrupt on to `main`, instead of typer's own message and exit status."""
 
-    def invoke(self, ctx: Any) -> Any:
+    def invoke(self, ctx: Any) -> object:
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as interrupt:

@@ -5,9 +5,8 @@ Both are callbacks from JAX to Python, so that `jax.jit`, `jax.grad` and `jax.vm
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property, partial
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -22,6 +21,7 @@ except ImportError:
     raise PathreplayError("JAX is not installed: pip install jax, or 'pathreplay[jax]'") from None
 
 Arrays = Mapping[str, jax.Array]
+Kept = tuple[jax.Array, tuple[jax.Array, ...]]
 """Decoded values by parameter key, in the shapes of `RenderFunction.initial_values`."""
 
 
@@ -32,7 +32,7 @@ class RenderFunction(SceneFunction):
     """
 
     @cached_property
-    def _functions(self) -> dict[tuple[int, int], Any]:
+    def _functions(self) -> dict[tuple[int, int], Callable[..., jax.Array]]:
         """Differentiable JAX functions by sensor and samples per pixel."""
         return {}
 
@@ -64,7 +64,7 @@ class RenderFunction(SceneFunction):
         return image
 
 
-def _function(render: RenderFunction, sensor: int, spp: int) -> Any:
+def _function(render: RenderFunction, sensor: int, spp: int) -> Callable[..., jax.Array]:
     """The image as a function of seed and values, with its vector-Jacobian product."""
     size = _size(render, sensor)
 
@@ -81,10 +81,10 @@ def _function(render: RenderFunction, sensor: int, spp: int) -> Any:
     def function(seed: jax.Array, values: tuple[jax.Array, ...]) -> jax.Array:
         return call(picture, jax.ShapeDtypeStruct(size, jnp.float32), seed, *values)
 
-    def forward(seed: jax.Array, values: tuple[jax.Array, ...]) -> tuple[jax.Array, Any]:
+    def forward(seed: jax.Array, values: tuple[jax.Array, ...]) -> tuple[jax.Array, Kept]:
         return function(seed, values), (seed, values)
 
-    def backward(kept: Any, weights: jax.Array) -> tuple[None, tuple[jax.Array, ...]]:
+    def backward(kept: Kept, weights: jax.Array) -> tuple[None, tuple[jax.Array, ...]]:
         seed, values = kept
         like = tuple(jax.ShapeDtypeStruct(value.shape, jnp.float32) for value in values)
         return None, call(gradient, like, seed, weights, *values)

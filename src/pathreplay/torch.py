@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
@@ -75,7 +76,7 @@ def _to_drjit(tensors: tuple[torch.Tensor, ...]) -> list[mi.TensorXf]:
     return [mi.TensorXf(tensor.detach().contiguous()) for tensor in tensors]
 
 
-def _to_torch(tensor: Any, device: torch.device) -> torch.Tensor:
+def _to_torch(tensor: dr.ArrayBase, device: torch.device) -> torch.Tensor:
     """A copy in memory that PyTorch owns, so that Dr.Jit cannot reuse it."""
     result: torch.Tensor = tensor.torch()
     return result.to(device).clone()

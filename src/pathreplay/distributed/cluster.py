@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import psutil
@@ -48,7 +49,7 @@ _VITAL = ("gcs_server", "raylet")
 class Cluster:
     """The cluster that a run is connected to."""
 
-    ray: Any
+    ray: ModuleType
     own: bool
     """Whether it is private to this run."""
     processes: list[psutil.Process] = field(default_factory=list)
@@ -98,7 +99,7 @@ def _runs(process: psutil.Process) -> bool:
         return False
 
 
-def load_ray() -> Any:
+def load_ray() -> ModuleType:
     """Import Ray. Raises PathreplayError if it is not installed or too old."""
     os.environ.setdefault(_MODE, "token")  # Ray reads it on import
     # Keep Ray from hiding devices from actors without a GPU; Ray warns if this is not set.
@@ -146,7 +147,7 @@ def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
         yield cluster
 
 
-def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
+def _start(ray: ModuleType, stack: contextlib.ExitStack, cores: int) -> Cluster:
     """Start a private cluster."""
     temporary = tempfile.gettempdir()
     # Only this user may enter the folder; Ray's default is open to all users. Socket paths have at most 107 characters.
@@ -192,7 +193,7 @@ def _sessions() -> set[int]:
     return ids - {os.getsid(0)}
 
 
-def _connect(ray: Any, address: str) -> None:
+def _connect(ray: ModuleType, address: str) -> None:
     if os.environ.get(_MODE) != "token":
         raise PathreplayError(
             f"ray: {_MODE} = '{os.environ.get(_MODE)}' turns authentication off, and anyone who reaches such a cluster "
@@ -213,7 +214,7 @@ def _connect(ray: Any, address: str) -> None:
         raise
 
 
-def _require_authentication(ray: Any, which: str) -> None:
+def _require_authentication(ray: ModuleType, which: str) -> None:
     core = ray._raylet
     if core.get_authentication_mode() != core.AuthenticationMode.TOKEN:
         raise PathreplayError(
@@ -229,7 +230,7 @@ GcsClient(address=sys.argv[1]).check_alive([], timeout=10)
 """
 
 
-def _require_closed(ray: Any, address: str) -> None:
+def _require_closed(ray: ModuleType, address: str) -> None:
     """Raise PathreplayError if the cluster accepts clients without a token."""
     gcs = ray.get_runtime_context().gcs_address
     others = {name: value for name, value in os.environ.items() if name not in (_TOKEN, "RAY_AUTH_TOKEN_PATH")}
@@ -242,7 +243,7 @@ def _require_closed(ray: Any, address: str) -> None:
 
 
 @contextmanager
-def _private_environment(ray: Any) -> Iterator[None]:
+def _private_environment(ray: ModuleType) -> Iterator[None]:
     """Make Ray start clusters on loopback, with our token and without usage statistics, within this block."""
     settings = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
     # Ray ends this process when the head has been silent for so many seconds; `Cluster.require` notices earlier.
@@ -266,7 +267,7 @@ def _private_environment(ray: Any) -> Iterator[None]:
 
 
 @contextmanager
-def _own_sessions(ray: Any) -> Iterator[None]:
+def _own_sessions(ray: ModuleType) -> Iterator[None]:
     """Start Ray's processes in sessions of their own within this block, where the kernel still ends them with us.
 
     A terminal or a scheduler sends its signals to all processes of a job. This process then finishes the iteration and
@@ -276,7 +277,7 @@ def _own_sessions(ray: Any) -> Iterator[None]:
     plain = services.ConsolePopen
 
     class SessionPopen(plain):  # type: ignore[misc, valid-type]
-        def __init__(self, *arguments: Any, **options: Any) -> None:
+        def __init__(self, *arguments: Any, **options: object) -> None:
             super().__init__(*arguments, **options, start_new_session=True)
 
     if sys.platform.startswith("linux"):
@@ -288,7 +289,7 @@ def _own_sessions(ray: Any) -> Iterator[None]:
 
 
 @contextmanager
-def _silent(ray: Any) -> Iterator[None]:
+def _silent(ray: ModuleType) -> Iterator[None]:
     """Suppress Ray's messages about its processes within this block; we log a line of our own instead."""
     worker = ray._private.worker
     plain = worker.print_to_stdstream

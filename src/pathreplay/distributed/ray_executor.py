@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import mitsuba as mi
@@ -39,6 +40,9 @@ SOON_S = 60.0
 
 LOOK_S, AGAIN_S = 0.1, 1.0
 """Seconds without an answer after which the processes of the cluster, and its head, are checked."""
+
+Reference = Hashable
+"""Of Ray, to an answer or to arrays in its object store."""
 
 Tell = Callable[[str], None]
 
@@ -77,7 +81,7 @@ class WorkerPool:
 
     cluster: Cluster
     actors: dict[int, Any]
-    setup: Any
+    setup: Reference
     """Ray's reference to the `WorkerInit`."""
     retries: int
     tell: Tell
@@ -86,13 +90,13 @@ class WorkerPool:
     counts: Counts = field(default_factory=Counts)
     schedulers: list[Scheduler] = field(default_factory=list)
     """One per executor."""
-    calls: dict[Any, _Call] = field(default_factory=dict)
+    calls: dict[Reference, _Call] = field(default_factory=dict)
     """Pending requests by Ray's reference to the answer."""
     ready: dict[int, Ready] = field(default_factory=dict)
     logged: set[str] = field(default_factory=set)
 
     @property
-    def ray(self) -> Any:
+    def ray(self) -> ModuleType:
         return self.cluster.ray
 
     def __post_init__(self) -> None:
@@ -104,21 +108,21 @@ class WorkerPool:
         busy = {call.actor for call in self.calls.values()}
         return [number for number in self.ready if number not in busy]
 
-    def ask(self, number: int, call: _Call, *request: Any) -> None:
+    def ask(self, number: int, call: _Call, *request: object) -> None:
         """Have an actor evaluate shards."""
         self.calls[self.actors[number].evaluate.options(max_task_retries=0).remote(*request)] = call
 
-    def sent(self, arrays: Arrays) -> Any:
+    def sent(self, arrays: Arrays) -> Arrays | Reference:
         """Arrays as request arguments: large ones go into the object store now, from which actors fetch them."""
         return arrays if _bytes_of(arrays) < SMALL else self.ray.put(arrays)
 
-    def answered(self, patience: float) -> list[tuple[_Call, Any]]:
+    def answered(self, patience: float) -> list[tuple[_Call, Reference]]:
         """Remove and return answered requests, with the references of their answers.
 
         Waits at most ``patience`` seconds. Raises PathreplayError if the cluster is lost.
         """
         end = time.monotonic() + patience
-        ready: list[Any] = []
+        ready: list[Reference] = []
         self.cluster.require_processes()
         while not ready:
             # Do not wait for the transfer: the actor can get its next request while its answer is on the way.
@@ -130,7 +134,7 @@ class WorkerPool:
                 self.cluster.require(AGAIN_S)
         return [(self.calls.pop(reference), reference) for reference in ready]
 
-    def fetch(self, call: _Call, reference: Any) -> list[Answer] | None:
+    def fetch(self, call: _Call, reference: Reference) -> list[Answer] | None:
         """Answers to the shards of a request; None if the actor was lost, and for requests that build the problem.
 
         Raises PathreplayError if no actor is left. Raises what an evaluation raised.
@@ -240,7 +244,9 @@ class RayExecutor:
             if not pool.ready and time.monotonic() - begin > SOON_S:
                 pool.log_once("ray: no actor is ready yet; check the cluster's free resources with 'ray status'")
 
-    def _hand_out(self, step: Step, shards: Sequence[Shard], size: int, values: Any, learned: Any) -> None:
+    def _hand_out(
+        self, step: Step, shards: Sequence[Shard], size: int, values: Arrays | Reference, learned: Arrays | Reference
+    ) -> None:
         """Send requests to idle actors. Values, and therefore gradients, have ``size`` bytes."""
         idle = self.pool.idle()
         for number in step.in_turn(idle):
@@ -337,7 +343,7 @@ def _needs(threads: int) -> dict[str, float]:
     return {"num_cpus": threads, "num_gpus": 1 if mi.variant().startswith("cuda") else 0}
 
 
-def _count(ray: Any, config: Config, threads: int, problem: Problem) -> int:
+def _count(ray: ModuleType, config: Config, threads: int, problem: Problem) -> int:
     """Number of actors to start. Raises PathreplayError if the cluster has too few cores or GPUs."""
     needs = {"CPU": threads, "GPU": _needs(threads)["num_gpus"]}
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -62,6 +62,12 @@ def versions() -> str:
     return ", ".join(f"{name} {version(name)}" for name in ("pathreplay", "mitsuba", "drjit", "numpy"))
 
 
+class Log(Protocol):
+    """The lines that Mitsuba logged."""
+
+    lines: list[str]
+
+
 class RayActor:
     """Evaluates shards of one job. Requests leave no state behind except compiled kernels."""
 
@@ -69,7 +75,7 @@ class RayActor:
         self.problem: Problem | None = None
         self.config: Config
         self.evaluators: dict[bool, Evaluate]
-        self.log: Any = None
+        self.log: Log
 
     def hello(self, setup: WorkerInit) -> Ready:
         """Build the problem; must be called first. Raises PathreplayError if this machine lacks something it needs."""
@@ -106,7 +112,7 @@ class RayActor:
         return self.evaluators[baseline]
 
 
-def _capture_log() -> Any:
+def _capture_log() -> Log:
     """Collect Mitsuba's log in memory, since nobody reads the terminal of an actor."""
 
     class LogBuffer(mi.Appender):  # type: ignore[misc]  # defined here, since the base class depends on the variant
@@ -118,7 +124,7 @@ def _capture_log() -> Any:
             if level >= mi.LogLevel.Warn:
                 self.lines.append(text)
 
-        def log_progress(self, *_: Any) -> None:
+        def log_progress(self, *_: object) -> None:
             pass
 
     buffer, logger, plain = LogBuffer(), mi.logger(), mi.DefaultFormatter()

@@ -10,7 +10,6 @@ import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -33,6 +32,7 @@ from pathreplay.scenes.builtin import BUILTINS
 from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.loading import as_xml_has_them, builtin_dict, coarse_pictures
 from pathreplay.scenes.parameters import get_array
+from pathreplay.types import Json
 
 _OPTION = "-o"
 
@@ -145,7 +145,7 @@ def _beside(export: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
     """
     params, files = mi.traverse(export.scene), {"transforms.json": _json(_cameras(export.scene))}
     names = file_names([*params.keys(), *(shape.id() for shape in export.scene.shapes())])
-    numbers: dict[str, Any] = {}
+    numbers: Json = {}
     for key, value in values.items():
         if value.ndim == 3 and value.shape[2] <= 4:
             files[f"textures/{names[key]}.png"] = png_bytes(value)
@@ -169,7 +169,7 @@ def _npy(value: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def _json(table: Any) -> bytes:
+def _json(table: object) -> bytes:
     return (json.dumps(table, indent=2) + "\n").encode()
 
 
@@ -187,7 +187,7 @@ def obj_bytes(mesh: mi.Mesh) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _cameras(scene: mi.Scene) -> dict[str, Any]:
+def _cameras(scene: mi.Scene) -> Json:
     """The pinhole cameras in the format of NeRF's `transforms.json`."""
     frames = []
     for sensor in scene.sensors():

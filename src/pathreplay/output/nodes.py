@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import mitsuba as mi
 
@@ -21,8 +21,7 @@ from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 from pathreplay.scenes.substitute import exchange
 
-Node = Any
-"""`mi.parser.SceneNode`."""
+Node: TypeAlias = "mi.parser.SceneNode"
 
 
 @dataclass(frozen=True)
@@ -36,10 +35,10 @@ class Owner:
 class Described:
     """The objects of a scene description; the first is the scene itself."""
 
-    def __init__(self, state: Any, folder: Path | None) -> None:
+    def __init__(self, state: mi.parser.ParserState, folder: Path | None) -> None:
         self._state, self.nodes, self.folder = state, list(state.nodes), folder
 
-    def add(self, properties: mi.Properties, kind: mi.ObjectType) -> Any:
+    def add(self, properties: mi.Properties, kind: mi.ObjectType) -> mi.Properties.ResolvedReference:
         """Add an object; returns a reference to it for use as a property value."""
         node = mi.parser.SceneNode()
         node.props, node.type = properties, kind
@@ -76,10 +75,10 @@ def _resolving(folder: Path | None) -> Iterator[None]:
 
 
 def describe(
-    scene: str | Path | Mapping[str, Any],
+    scene: str | Path | Mapping[str, object],
     arguments: Mapping[str, str],
     plugins: Mapping[str, str],
-    cameras: Mapping[str, Mapping[str, Any]],
+    cameras: Mapping[str, Mapping[str, object]],
     floats: Collection[str] = (),
 ) -> tuple[Described, list[Owner]]:
     """Parse a scene into its objects and the owners of its parameters, in the order of `mi.traverse`.
@@ -116,7 +115,7 @@ def describe(
     return described, owners
 
 
-def _join(state: Any, name: str, camera: Any) -> None:
+def _join(state: mi.parser.ParserState, name: str, camera: mi.parser.ParserState) -> None:
     """Insert the objects of a separately parsed camera into the scene."""
     offset = len(state.nodes)
     for node in camera.nodes:
@@ -128,7 +127,7 @@ def _join(state: Any, name: str, camera: Any) -> None:
     state.root.props[name] = mi.Properties.ResolvedReference(offset)
 
 
-def _owners(config: Any, state: Any, nodes: list[Node]) -> list[Owner]:
+def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes: list[Node]) -> list[Owner]:
     """Owners of all parameters, from an instance of the scene in which each object has a unique id."""
     copy = mi.parser.ParserState(state)  # instantiation replaces references by objects
     names = {f"object {i}": i for i in range(1, len(nodes))}

@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -115,7 +114,7 @@ def render(
         PathreplayError: the integrator cannot render the scene.
     """
     counts = passes(sensor, spp)
-    total: Any = 0.0
+    total = np.zeros(())
     done = 0
     for i, count in enumerate(counts):
         number = seed if i == 0 else int(np.random.SeedSequence([seed, i]).generate_state(1)[0])

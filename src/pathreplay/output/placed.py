@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -96,12 +95,12 @@ class Placing:
         grid.write(stream)  # the box is in the file, and has no accessor in Python
         return vol_bounds(stream.raw_buffer())
 
-    def _mesh(self, mesh: Any, node: Node) -> None:
+    def _mesh(self, mesh: mi.Mesh, node: Node) -> None:
         _remove(node.props, *_MADE_BY, "to_world")
         node.props.set_plugin_name("ply")
         node.props["filename"] = self._ply(mesh, node.props.id())
 
-    def _ply(self, mesh: Any, name: str) -> str:
+    def _ply(self, mesh: mi.Mesh, name: str) -> str:
         """Add the file of a mesh unless it exists; returns its name."""
         if mesh.id() not in self._meshes:
             stream = mi.MemoryStream()
@@ -125,7 +124,7 @@ class Placing:
         _remove(parent.props, name)
         parent.props[name] = self.described.add(properties, mi.ObjectType.Shape)
 
-    def _known(self, instance: Any, what: str) -> mi.Properties:
+    def _known(self, instance: mi.Object, what: str) -> mi.Properties:
         """Properties of an existing object that its parameters determine completely."""
         plugin, part = _KNOWN.get(instance.class_name(), ("", ""))
         params = mi.traverse(instance)

@@ -27,6 +27,7 @@ from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.parameters import get_array, is_empty, to_value
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
+from pathreplay.types import Json
 
 SCENE = "scene.xml"
 
@@ -47,13 +48,13 @@ _ADDRESS = re.compile(r"object_\d+")
 class Source:
     """The source of a scene, before values are assigned."""
 
-    scene: str | Path | Mapping[str, Any]
+    scene: str | Path | Mapping[str, object]
     """Path of an XML file, or a Mitsuba dictionary."""
     arguments: Mapping[str, str]
     """Values that replace ``$name`` in the file."""
     plugins: Mapping[str, str]
     """Replaced plugin types, old -> new."""
-    cameras: Mapping[str, Mapping[str, Any]]
+    cameras: Mapping[str, Mapping[str, object]]
     """Additional sensors by id."""
     floats: Collection[str] = ()
     """Image files of textures that are stored as floating-point numbers; see `load_file_with`."""
@@ -78,7 +79,7 @@ class Exported:
     """Differences from the original scene."""
 
 
-def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | None = None) -> Exported:
+def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | None = None) -> Exported:
     """Export a scene with the given parameter values.
 
     Args:
@@ -133,7 +134,7 @@ def require_same(original: mi.Scene, folder: Path) -> None:
             )
 
 
-def _alike(value: Any, other: Any) -> bool:
+def _alike(value: object, other: object) -> bool:
     if isinstance(value, (bool, int, str)) or isinstance(other, (bool, int, str)):
         return bool(value == other)
     try:
@@ -186,13 +187,13 @@ def _plain_plugins(described: Described) -> list[str]:
     return notes
 
 
-def _plain_integrator(described: Described, wanted: Mapping[str, Any] | None) -> list[str]:
+def _plain_integrator(described: Described, wanted: Mapping[str, object] | None) -> list[str]:
     """Set the wanted integrator, else the scene's; replaces a differentiable one, and returns a note about it."""
     root = described.nodes[0]
     children = dict(described.children(root))
     own = next((name for name, node in children.items() if node.type == mi.ObjectType.Integrator), None)
     if wanted is not None:
-        options = dict(wanted)
+        options: Json = dict(wanted)
     elif own is None:
         options = {"type": "pathreplay"}  # the default integrator of jobs
     else:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any
 
 from pathreplay.errors import PathreplayError
 
@@ -44,7 +43,9 @@ def name_of(number: int) -> str:
 
 
 @contextmanager
-def handled(handle: Callable[[int, FrameType | None], Any], keep: Callable[[], bool] = lambda: False) -> Iterator[None]:
+def handled(
+    handle: Callable[[int, FrameType | None], object], keep: Callable[[], bool] = lambda: False
+) -> Iterator[None]:
     """Within this block ``handle`` receives the signals in `ENDING`, if this is the main thread.
 
     SIGTERM and SIGHUP stay ignored if the parent process ignores them (nohup). The previous handlers are restored at

@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.device import backend_of
@@ -77,7 +77,7 @@ def _register_stand_ins(variant: str, plugins: Plugins) -> None:
     colours = variant.removesuffix("_polarized").rsplit("_", 1)[-1]
     alike = [name for name in usable if name.endswith(colours)] or usable
 
-    def refuse(plugin: str, props: Any) -> Any:
+    def refuse(plugin: str, props: mi.Properties) -> NoReturn:
         raise PathreplayError(f"{plugin}: variant {variant!r} has no derivatives: use {' or '.join(alike)}")
 
     for plugin, (kind, *_) in plugins.items():

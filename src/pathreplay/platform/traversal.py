@@ -11,7 +11,7 @@ from typing import Any
 import mitsuba as mi
 
 
-def traversed(thing: Any) -> Any:
+def traversed(thing: mi.Object) -> mi.SceneParameters:
     """`mi.traverse(thing)` without parameters that are None."""
     params = mi.traverse(thing)
     known = {key for key, _ in known_values(params)}
@@ -20,7 +20,7 @@ def traversed(thing: Any) -> Any:
     return params
 
 
-def known_values(params: Any) -> Iterator[tuple[str, Any]]:
+def known_values(params: mi.SceneParameters) -> Iterator[tuple[str, Any]]:
     """Iterate over the parameters with their values, for reading only: `update` does not notice in-place changes."""
     for key, (value, kind, node, _) in params.properties.items():
         current = value if kind is None else params.get_property(value, kind, node)

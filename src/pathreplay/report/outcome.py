@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from pathreplay.inverse.parameters.grids import matched, rmse, shown, slices
 from pathreplay.inverse.parameters.pose import Pose, PoseError, error_names
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.runs.run_folder import resume_command
+from pathreplay.types import Json
 
 # Gain of difference images, which would be black after convergence otherwise.
 DIFFERENCE_GAIN = 4.0
@@ -58,9 +58,9 @@ class ViewPictures:
             if image is not None
         }
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """The view's entry of views.json."""
-        table: dict[str, Any] = {"is_test": self.is_test, "exposure": self.exposure}
+        table: Json = {"is_test": self.is_test, "exposure": self.exposure}
         if self.factors:
             table["recovered_exposure"] = list(self.factors)
         for kind, likeness in self.likenesses.items():
@@ -145,10 +145,10 @@ class Recovered:
             return None
         return float(np.linalg.norm(matched(self.result, self.truth) - self.truth) / np.linalg.norm(self.truth))
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Entry of parameters.json: small values in full, large ones by shape, mean and range."""
         value = self.result
-        table: dict[str, Any] = {"shape": list(value.shape)}
+        table: Json = {"shape": list(value.shape)}
         if value.size <= 16:
             table["value"] = value.tolist()
             table |= {kind: array.tolist() for kind, array in self.known("start", "truth").items()}
@@ -189,9 +189,9 @@ class RecoveredPose:
                 table[f"{kind}, {part}"] = ", ".join(f"{v:.4g}{unit}" for v in array)
         return table | {kind.replace("_at_", " at the "): str(e) for kind, e in reversed(self.errors().items())}
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Entry of parameters.json."""
-        table: dict[str, Any] = {"pose": self.pose.kind, "pivot": list(self.pose.pivot)}
+        table: Json = {"pose": self.pose.kind, "pivot": list(self.pose.pivot)}
         for kind, parts in (("start", self.start), ("result", self.result)):
             table[kind] = {part: array.tolist() for part, array in parts.items()}
         if self.value.shape == (4, 4):

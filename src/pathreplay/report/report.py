@@ -8,11 +8,11 @@ import os
 import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import PIL.Image
+from matplotlib.axes import Axes
 
 from pathreplay.inverse.images.io import Image, displayed, png_bytes, resized
 from pathreplay.inverse.loop.checkpoint import Entry
@@ -281,7 +281,7 @@ def drawn(figure: Figure, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-def _plain(axes: Any, along: str) -> None:
+def _plain(axes: Axes, along: str) -> None:
     axes.set_xlabel(along)
     axes.grid(True, color=GREY, alpha=0.25, linewidth=0.5)
     axes.tick_params(which="both", colors=GREY)

@@ -13,7 +13,6 @@ import stat
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -24,6 +23,7 @@ from pathreplay.platform.atomic_files import Content, chunks
 from pathreplay.platform.files import file_problem
 from pathreplay.platform.interrupts import undisturbed
 from pathreplay.runs.folder_lock import FolderLock
+from pathreplay.types import Json
 
 PART = ".part"
 _CONFIGS = "config.toml", "config.yaml", "config.json"
@@ -204,7 +204,7 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
         copy: dict[str, Content] = {name: (job.base / job.source.name).read_bytes()}
     else:
         copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
-    origin: dict[str, Any] = {
+    origin: Json = {
         "base": str(job.base.resolve()),
         "config": None if job.source is None else str(job.source),
     }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import itertools
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -80,7 +79,7 @@ def _last(run: Past) -> Mapping[str, float]:
     return run.history[-1].errors if run.history else {}
 
 
-def _keys(tables: Iterable[Mapping[str, Any]]) -> list[str]:
+def _keys(tables: Iterable[Mapping[str, object]]) -> list[str]:
     """The distinct keys of all tables, in order of first occurrence."""
     return list(dict.fromkeys(itertools.chain.from_iterable(tables)))
 
@@ -98,7 +97,7 @@ def _differences(runs: list[Past]) -> list[Row]:
     return rows
 
 
-def _flattened(name: str, value: Any) -> Iterable[tuple[str, Any]]:
+def _flattened(name: str, value: object) -> Iterable[tuple[str, object]]:
     if isinstance(value, dict):
         for key, entry in value.items():
             yield from _flattened(f"{name}.{key}" if name else str(key), entry)

@@ -6,7 +6,6 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import safetensors
 from pydantic import TypeAdapter, ValidationError
@@ -16,6 +15,7 @@ from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.report.watch.run_files import read_own
 from pathreplay.runs.run_folder import CHECKPOINT, read_job
+from pathreplay.types import Json
 
 _HISTORY = TypeAdapter(list[Entry])
 
@@ -46,7 +46,7 @@ class Past:
             ) from None
 
     @cached_property
-    def views(self) -> dict[str, dict[str, Any]]:
+    def views(self) -> dict[str, Json]:
         """Entries of views.json by view; empty before the end of the run."""
         table = self._json("views.json")
         return table if all(isinstance(view, dict) for view in table.values()) else {}
@@ -60,7 +60,7 @@ class Past:
     def test_views(self) -> list[str]:
         return [name for name, view in self.views.items() if view.get("is_test") is True]
 
-    def _json(self, name: str) -> dict[str, Any]:
+    def _json(self, name: str) -> Json:
         try:
             table = json.loads(read_own(self.folder / name) or b"{}")
         except (ValueError, RecursionError):

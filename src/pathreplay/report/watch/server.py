@@ -17,13 +17,18 @@ import time
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 from urllib.parse import unquote, urlsplit
 
 from pathreplay.errors import PathreplayError
 from pathreplay.report.live_page import FOLDER
 from pathreplay.report.pages.document import document, policy
 from pathreplay.report.watch import run_files
+
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
+
+Request: TypeAlias = "socket.socket | tuple[bytes, socket.socket]"
 
 # Seconds within which a client must send its request and receive the answer.
 PATIENCE = 30
@@ -56,21 +61,21 @@ class RunServer(ThreadingHTTPServer):
         shown = socket.gethostname() if everywhere else f"[{host}]" if ":" in host else host
         self.address = f"http://{shown}:{self.server_address[1]}/{self.token}/"
 
-    def process_request(self, request: Any, client_address: Any) -> None:
+    def process_request(self, request: Request, client_address: object) -> None:
         """Answer in a thread of its own, or close the connection if there are too many."""
         if not self.room.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
+    def process_request_thread(self, request: Request, client_address: object) -> None:
         """Answer, then release the connection's slot."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self.room.release()
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
+    def handle_error(self, request: Request, client_address: object) -> None:
         """Ignore clients that disconnect; report other errors."""
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             super().handle_error(request, client_address)
@@ -97,7 +102,7 @@ class _Within(io.RawIOBase):
         """Return True."""
         return True
 
-    def readinto(self, buffer: Any) -> int:
+    def readinto(self, buffer: WriteableBuffer) -> int:
         """Wait for bytes until the deadline."""
         if (left := self.end - time.monotonic()) <= 0:
             raise TimeoutError
@@ -199,7 +204,7 @@ class Handler(BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(data)
 
-    def log_message(self, format: str, *arguments: Any) -> None:
+    def log_message(self, format: str, *arguments: object) -> None:
         """Log nothing, so that the address stays visible in the terminal."""
 
 
