@@ -19,8 +19,6 @@ continuous there, but an edge of the scene seen through the lobe is a boundary t
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -54,7 +52,7 @@ class DielectricAD:
     specular_reflectance: mi.Texture | None  # None means 1, at no cost
     specular_transmittance: mi.Texture | None
 
-    def __init__(self, props: Any) -> None:
+    def __init__(self, props: mi.Properties) -> None:
         mi.BSDF.__init__(self, props)
         if mi.is_polarized:
             raise PathreplayError(
@@ -74,7 +72,7 @@ class DielectricAD:
 
     # ------------------------------------------------ parameters ------------------------------------------------
 
-    def traverse(self, cb: Any) -> None:
+    def traverse(self, cb: mi.TraversalCallback) -> None:
         # Discontinuous, as in Mitsuba's other dielectrics: when refracted light moves, the edges seen in it move.
         cb.put("eta", self.eta, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
         for name in TINTS:
@@ -93,7 +91,14 @@ class DielectricAD:
 
     # -------------------------------------------- sampling, evaluation --------------------------------------------
 
-    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+    def sample(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool | bool = True,
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         has_r = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
         has_t = ctx.is_enabled(mi.BSDFFlags.DeltaTransmission, 1)
         bs = dr.zeros(mi.BSDFSample3f)
@@ -138,11 +143,17 @@ class DielectricAD:
             tinted[selected_t] = tinted * dr.square(η_ti)
         return bs, dr.select(active, tinted, 0)
 
-    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+    def eval(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
+    ) -> mi.Spectrum:
         return mi.Spectrum(0)  # both lobes are Dirac deltas
 
-    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+    def pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
+    ) -> mi.Float:
         return mi.Float(0)
 
-    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+    def eval_pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
+    ) -> tuple[mi.Spectrum, mi.Float]:
         return mi.Spectrum(0), mi.Float(0)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.plugins.supergrid import Bounds
+from pathreplay.samplers.sampler import Sampler
+
+T = TypeVar("T")
 
 #: Rate of residual collisions over the largest residual density. A factor of two halves the exponent of the variance; a
 #: factor of four costs more time than it saves noise (`pathreplay bench gridmedium`).
@@ -149,7 +152,7 @@ def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi
 
 
 def free_flight(
-    cells: Cells, box: mi.BoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool | bool
+    cells: Cells, box: mi.ScalarBoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool | bool
 ) -> tuple[mi.Float, mi.Float]:
     """Sample the distance of the next tentative collision; return it and its majorant, or infinity and 0 without one.
 
@@ -167,7 +170,7 @@ def free_flight(
 
     trace = begin(cells, ray, a, b)
 
-    def step(active: Any, cell: Any, t: Any, τ: Any, m: Any) -> tuple[Any, ...]:
+    def step(active: mi.Bool, cell: mi.Vector3f, t: mi.Float, τ: mi.Float, m: mi.Float) -> tuple[dr.ArrayBase, ...]:
         m = cells.lookup(mi.Float, cell, active)
         crossings = trace.crossing(cell)
         t_next = dr.minimum(dr.min(crossings), trace.end)

@@ -14,7 +14,7 @@ volumes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -43,7 +43,7 @@ class GridMedium:
 
     phase_function: Callable[[], mi.PhaseFunction]  # a method of Mitsuba's class
 
-    def __init__(self, props: Any) -> None:
+    def __init__(self, props: mi.Properties) -> None:
         mi.Medium.__init__(self, props)
         phase = self.phase_function()
         if mi.has_flag(phase.flags(), mi.PhaseFunctionFlags.Microflake):
@@ -64,7 +64,7 @@ class GridMedium:
 
     # ------------------------------------------------ parameters ------------------------------------------------
 
-    def traverse(self, cb: Any) -> None:
+    def traverse(self, cb: mi.TraversalCallback) -> None:
         for name in ("scale", "albedo", "sigma_t", "emission"):
             if getattr(self, name) is not None:
                 cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
@@ -126,7 +126,9 @@ class GridMedium:
     def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool | bool = True) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum(self.majorant)
 
-    def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    def get_scattering_coefficients(
+        self, mei: mi.MediumInteraction3f, active: mi.Bool | bool = True
+    ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
         σ_t = self.scale * self.sigma_t.eval(mei, active)
         return σ_t * self.albedo.eval(mei, active), self.majorant - σ_t, σ_t
 
@@ -179,14 +181,14 @@ def _volume(props: Any, name: str, default: float | None) -> Any:
     return mi.PluginManager.instance().create_object(constant)
 
 
-def _number(props: Any, name: str, default: float) -> float:
+def _number(props: mi.Properties, name: str, default: float) -> float:
     value = props.get(name, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < float("inf"):
         raise PathreplayError(f"gridmedium: {name} is {value}; give a finite number, at least 0")
     return float(value)
 
 
-def _choice(props: Any) -> bool | str:
+def _choice(props: mi.Properties) -> bool | str:
     value = props.get("supergrid", "auto")
     if value != "auto" and not isinstance(value, bool):
         raise PathreplayError(f"gridmedium: supergrid is {value!r}; use true, false or 'auto'")

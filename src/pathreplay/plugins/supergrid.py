@@ -17,7 +17,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 #: Voxels along the side of the smallest cell. Half of it gives eight times as many cells, and more steps between them.
 BASE = 4
 #: Lowest, mean and highest value (TensorXf, z y x), one entry per voxel or cell.
-Values = tuple[Any, Any, Any]
+Values: TypeAlias = "tuple[mi.TensorXf, mi.TensorXf, mi.TensorXf]"
 #: Cost of a step between cells relative to a tentative collision: see `pathreplay bench supergrid`.
 STEP_COST = 0.15
 

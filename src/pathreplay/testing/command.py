@@ -35,7 +35,7 @@ def check_all(
     *,
     integrator: Spec = None,
     max_depth: int | None = None,
-    boundary: Mapping[str, Any] | None = None,
+    boundary: Mapping[str, object] | None = None,
     **options: Any,
 ) -> Iterator[GradientCheck]:
     """Yield ``check_gradient(scene, key, **options)`` for each key that matches the patterns, as soon as it is done.

@@ -8,14 +8,13 @@ contributions add up. Random signs would reduce the derivative by the square roo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes.parameters import displaced
+from pathreplay.scenes.parameters import SceneValue, displaced
 from pathreplay.scenes.spectra import coefficients, values_of_p
 from pathreplay.testing.stencil import BACKWARD, CENTRAL, FORWARD, Stencil
 

@@ -19,13 +19,13 @@ from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from pathreplay import __version__
 from pathreplay.errors import PathreplayError
 from pathreplay.platform import backend, interrupts
 from pathreplay.platform.atomic_files import require_writable, write_whole
 from pathreplay.platform.device import device_of
+from pathreplay.types import Json
 
 TIMEOUT_S = 300
 """Timeout per item in seconds: far more than any item takes on a CPU."""
@@ -33,14 +33,14 @@ ROUNDS = 7
 WALLS = "red.reflectance.value"
 
 # Scene, its arguments, the parameter, and options of `check_gradient`: surfaces, geometry, textures, media.
-TRUTHS: dict[str, tuple[str, dict[str, int], str, dict[str, Any]]] = {
+TRUTHS: dict[str, tuple[str, dict[str, int], str, Json]] = {
     "colour of a wall": ("cornell-box", {"resolution": 32}, WALLS, {}),
     "texture": ("cornell-box-photo", {"resolution": 32, "texture": 16}, "back.bsdf.reflectance.data", {}),
     "index of glass": ("glass-pane", {"resolution": 24}, "glass.eta", {}),
     "density": ("cloud", {"resolution": 16, "grid": 8, "views": 1}, "cloud.interior_medium.sigma_t.data", {}),
 }
 # Integrator and options, side of the image, samples per pixel, depth.
-TIMINGS: dict[str, tuple[dict[str, Any], int, int, int]] = {
+TIMINGS: dict[str, tuple[Json, int, int, int]] = {
     f"{name}, {side} x {side}, depth {depth}": ({"type": kind, **more}, side, 16, depth)
     for side in (128, 512)
     for depth in (8, 64)
@@ -62,7 +62,7 @@ class Item:
     """The result of one item: measured facts, or an error message."""
 
     name: str
-    facts: dict[str, Any]
+    facts: Json
     error: str = ""
 
 
@@ -116,7 +116,7 @@ def _in_process(variant: str, name: str) -> Item:
     return Item(name, json.loads(lines[-1][lines[-1].index('{"facts"') :])["facts"])
 
 
-def truth(name: str) -> dict[str, Any]:
+def truth(name: str) -> Json:
     """Compare a gradient with finite differences."""
     from pathreplay.scenes.loading import load_scene_for
     from pathreplay.testing.gradient import check_gradient

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Literal, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -17,13 +17,13 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.stateful import stateful
 from pathreplay.scenes.descriptions import errors_as
-from pathreplay.scenes.parameters import get_array
+from pathreplay.scenes.parameters import SceneValue, get_array
 from pathreplay.testing.direction import Line
 from pathreplay.testing.stencil import Stencil
 from pathreplay.testing.verdict import NEGLIGIBLE, Judgement, judge
 
 Mode = Literal["backward", "forward"]
-Move = Callable[[Any, "mi.Float"], Any]
+Move: TypeAlias = "Callable[[SceneValue, mi.Float], SceneValue]"
 Loss = Callable[["mi.TensorXf"], "mi.Float"]
 
 

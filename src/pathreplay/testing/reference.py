@@ -7,7 +7,7 @@ settings are read from the integrator under test.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import mitsuba as mi
 
@@ -17,7 +17,7 @@ from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import stateful
 from pathreplay.scenes.descriptions import load_integrator
 
-Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
+Spec: TypeAlias = "mi.Integrator | Mapping[str, object] | str | None"
 """An integrator: an object, a dictionary, a plugin name, or None for the default."""
 
 NO_ROULETTE = 2**30
@@ -29,7 +29,7 @@ LONGEST_WITHOUT_ROULETTE = 64
 
 
 def integrator_under_test(
-    spec: Spec, scene: mi.Scene, max_depth: int | None = None, boundary: Mapping[str, Any] | None = None
+    spec: Spec, scene: mi.Scene, max_depth: int | None = None, boundary: Mapping[str, object] | None = None
 ) -> mi.Integrator:
     """Return the integrator that ``spec`` describes: an object (used unchanged), a dictionary, a plugin name, or None.
 

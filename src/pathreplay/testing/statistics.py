@@ -7,19 +7,21 @@ for 300. All functions take numbers or arrays; samples are along the first axis.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+Numbers: TypeAlias = "np.ndarray | float"
+
 
 class Gap(NamedTuple):
     """A difference of means, its standard error, and its normal deviate."""
 
-    value: Any
-    error: Any
-    z: Any
+    value: Numbers
+    error: Numbers
+    z: Numbers
 
 
 def mean_and_error(samples: ArrayLike) -> tuple[Any, Any]:
