@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -28,6 +27,7 @@ from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative
 from pathreplay.adjoint.record import Layout, record_type, room_for
 from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, first_walk, walk_back
 from pathreplay.samplers.pixel_samples import PixelSamples
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
@@ -46,7 +46,7 @@ class PixelLoss:
 def pixel_sweep(
     trace: TraceConfig,
     numbers: PixelSamples,
-    camera: Callable[..., Any],
+    camera: Callable[[Sampler, mi.Bool], tuple[mi.Ray3f, mi.Spectrum]],
     paths: int,
     loss: PixelLoss,
     lost: NonFiniteCounter,

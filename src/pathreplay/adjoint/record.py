@@ -238,7 +238,7 @@ def _blank(layout: Layout, ray0: mi.Ray3f) -> VertexRecord:
     return VertexRecord(at, u, kept, no, at.hit, zero, mi.Spectrum(0))
 
 
-def _put(v: VertexRecord, place: str, value: Any) -> None:
+def _put(v: VertexRecord, place: str, value: object) -> None:
     *way, name = place.split(".")
     setattr(reduce(getattr, way, v), name, value)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +23,7 @@ def first_walk(
     sampler: Sampler,
     path: PathState,
     layout: Layout,
-    records: Any,
+    records: dr.Local[object],
     first: mi.UInt32,
     lost: NonFiniteCounter,
 ) -> tuple[Any, mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
@@ -70,7 +69,7 @@ class RecordedPath:
     """``count`` consecutive vertices of a path in the records, from index ``first`` on."""
 
     layout: Layout
-    records: Any
+    records: dr.Local[object]
     first: mi.UInt32
     count: mi.UInt32
     last: mi.UInt32  # index of the last record of the whole path

@@ -13,7 +13,6 @@ the integral consists of film positions and distances.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import reduce
 from operator import add
-from typing import Any
 from weakref import ReferenceType, ref
 
 import drjit as dr
@@ -32,6 +31,7 @@ from pathreplay.integrators.properties import choice, deviation, whole_number
 from pathreplay.integrators.scene_facts import SceneFacts, facts_of
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.transport.vertex import TraceConfig
+from pathreplay.types import Json
 
 ADJOINTS = ("auto", "recorded", "replay")
 #: Old property names of 0.1.0 and their current names.
@@ -44,7 +44,7 @@ RENAMED = {
     "numbers": "sampling",
 }
 ATTACH = ("delta", "all", "none")
-NULL_BRANCHING = ("auto", True, False)
+NULL_BRANCHING: tuple[str | bool, ...] = ("auto", True, False)
 SAMPLING = ("scene", "sobol")
 BOUNDARIES = ("auto", "none", "primary", "all")
 EDGES = "edges"
@@ -63,7 +63,7 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
             f"{name}: max_depth = {depth} is more than adjoint = 'recorded' can hold ({MAX_DEPTH}): "
             "use adjoint = 'replay', which has no limit"
         )
-    branch = choice(props, name, "null_branching", "auto", NULL_BRANCHING)
+    branch: str | bool = choice(props, name, "null_branching", "auto", NULL_BRANCHING)
     recovery = Recovery(noise=deviation(props, name, "jacobian_noise", Recovery.noise))
     auto = adjoint == "auto"
     if auto:

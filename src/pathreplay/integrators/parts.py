@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +19,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass, Seed
 from pathreplay.integrators.film.image import MOST_SAMPLES, film_size
 from pathreplay.platform.traversal import known_values
-from pathreplay.scenes.parameters import is_transform
+from pathreplay.scenes.parameters import SceneValue, is_transform
 
 # Largest number of samples of a pass that is not split. The relative error of a scalar's gradient is then below 1e-2 if
 # all samples contribute equally, and far below its noise otherwise.
@@ -75,7 +74,7 @@ class Sums:
             self._values = [
                 part for _, value in known_values(params) for part in _arrays(value) if dr.grad_enabled(part)
             ]
-        self._sums: list[Any] = [None] * len(self._values)
+        self._sums: list[dr.ArrayBase | None] = [None] * len(self._values)
         self.take()
 
     def take(self) -> None:
@@ -103,7 +102,7 @@ def summed(scene: mi.Scene, passes: Sequence[Pass]) -> Iterator[Callable[[], Non
             sums.give()
 
 
-def _arrays(value: Any) -> list[Any]:
+def _arrays(value: SceneValue) -> list[dr.ArrayBase]:
     return [value.matrix, value.inverse_transpose] if is_transform(value) else [value]
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import reduce
 from operator import add
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -32,6 +31,7 @@ from pathreplay.transport.motion import path_moves, weights_vary
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
+from pathreplay.types import Json
 
 UNBOUNDED = 0xFFFFFFFF
 
@@ -283,7 +283,7 @@ class PathIntegrator:
         """Restore the result of `state_dict`. Raises PathreplayError unless it is empty."""
         require_nothing_learned(learned)
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Json:
         """See `StatefulIntegrator`."""
         return {}
 
@@ -291,7 +291,7 @@ class PathIntegrator:
         """Suppress these notes."""
         self.warned.update(notes)
 
-    def _described(self, **more: Any) -> str:
+    def _described(self, **more: object) -> str:
         depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
         values = {"max_depth": depth, "rr_depth": self.rr_depth, **more}
         return f"{type(self).__name__}[{', '.join(f'{key} = {value}' for key, value in values.items())}]"

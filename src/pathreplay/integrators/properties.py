@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeVar
 
 import mitsuba as mi
 
@@ -12,7 +12,7 @@ from pathreplay.errors import PathreplayError, shown
 LARGEST = 2**31 - 1
 
 
-def choice(props: mi.Properties, plugin: str, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
+def choice(props: mi.Properties, plugin: str, name: str, default: T, choices: tuple[T, ...]) -> T:
     """Read a property that must be one of ``choices``. Raises PathreplayError otherwise."""
     value = props.get(name, default)
     # Compare types as well, since 1 == True.

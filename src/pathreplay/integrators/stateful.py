@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +13,7 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass, Seed, Which
 from pathreplay.integrators.pass_state import PassState
+from pathreplay.types import Json
 
 Learned = Mapping[str, np.ndarray]
 _RECORDABLE = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
@@ -136,7 +137,7 @@ class Stateless:
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None:
         require_nothing_learned(learned)
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Json:
         return {}
 
 

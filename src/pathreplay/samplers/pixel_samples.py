@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import mitsuba as mi
+
+from pathreplay.samplers.sampler import Sampler
 
 SETS = 4
 """Number of low-discrepancy sets per pixel, if it has that many paths. With fewer sets, the weight of a path is the
@@ -39,11 +41,11 @@ class IndependentSets:
         """See `PixelSamples`."""
         return 1
 
-    def first(self) -> Any:
+    def first(self) -> Sampler:
         """See `PixelSamples`."""
         return self.sampler
 
-    def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
+    def of(self, before: Sampler, place: mi.UInt32, size: int, number: mi.UInt32) -> Sampler:
         """See `PixelSamples`: the sampler continues its sequence."""
         return before
 
@@ -59,10 +61,10 @@ class SobolSets:
         """See `PixelSamples`."""
         return -(-paths // min(SETS, paths))
 
-    def first(self) -> Any:
+    def first(self) -> Sampler:
         """See `PixelSamples`."""
         return self.sampler(mi.UInt32(0), 1, mi.UInt32(0))
 
-    def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
+    def of(self, before: Sampler, place: mi.UInt32, size: int, number: mi.UInt32) -> Sampler:
         """See `PixelSamples`."""
         return self.sampler(place, size, number)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
+
+T = TypeVar("T", bound="dr.ArrayBase")
 
 # Relative deviation of the normal's derivatives from those of a sphere up to which a surface is treated as a sphere.
 UMBILIC = 1e-4
@@ -41,7 +43,7 @@ def _scaled(si: mi.SurfaceInteraction3f, by: mi.Float) -> mi.SurfaceInteraction3
     return si
 
 
-def _times(value: Any, by: mi.Float) -> Any:
+def _times(value: T, by: mi.Float) -> T:
     moved = dr.select(by == 0, dr.detach(value), value)
     return dr.replace_grad(value, by * moved)
 

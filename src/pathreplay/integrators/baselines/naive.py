@@ -7,7 +7,7 @@ back-propagated. Memory therefore grows with the number of paths times their len
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +18,8 @@ from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.step import repeat_step
 from pathreplay.transport.vertex import TraceConfig
+
+T = TypeVar("T")
 
 
 def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
@@ -49,7 +51,7 @@ def _cut(state: tuple[Any, ...]) -> Any:
     """
 
     class Cut(dr.CustomOp):  # type: ignore[misc]
-        def eval(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def eval(self, state: tuple[dr.ArrayBase, ...]) -> tuple[dr.ArrayBase, ...]:
             return tuple(type(value)(value) for value in state)
 
         def backward(self) -> None:
