@@ -91,7 +91,7 @@ def test_a_glob_keeps_what_has_a_derivative_and_an_exact_key_must(params: Any) -
 
 
 @pytest.mark.parametrize(
-    ("key", "way_out"),
+    ("key", "remedy"),
     [
         ("glass.bsdf.eta", "dielectric_ad"),
         ("lacquer.bsdf.eta", "no replacement yet"),
