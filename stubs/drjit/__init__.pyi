@@ -1,4 +1,4 @@
-"""The part of Dr.Jit's interface that pathreplay uses, with functions that keep the types of their arrays."""
+"""The part of Dr.Jit's interface that pathreplay uses; functions preserve the types of arrays where that is simple."""
 
 import enum
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +19,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 _C = TypeVar("_C", bound=type[Any])
 
 e: float
-inf: Any  # a number, which members of records take
+inf: Any  # a number that may be assigned to members of type Float
 nan: float
 pi: float
 two_pi: float
@@ -240,7 +240,7 @@ def scatter_reduce(
 ) -> None: ...
 
 class Local(Sequence[T]):
-    """Memory of each lane."""
+    """Memory local to each lane."""
 
     def read(self, index: object, active: object = True) -> T: ...
     def write(self, value: T, index: object, active: object = True) -> None: ...

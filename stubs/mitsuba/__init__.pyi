@@ -1,7 +1,7 @@
-"""The part of Mitsuba's interface that pathreplay uses, as it is in llvm_ad_rgb.
+"""The part of Mitsuba's interface that pathreplay uses, in variant llvm_ad_rgb.
 
-Mitsuba's own stubs take mypy minutes to read and describe one variant, too. What is rarely used is loose here; what is
-misspelt, or an object of another kind than the one asked for, is an error.
+Mitsuba's own stubs describe one variant, too, and mypy takes minutes to read them. What is rarely used has loose types
+here. A misspelt name and an object of the wrong class are errors.
 """
 
 import enum
@@ -24,9 +24,9 @@ __version__: str
 
 # ---------------------------------------------------------------- arrays
 
-_Left = TypeVar("_Left")  # what may stand at the right of an array, so that the result is of the array's type
-_Right = TypeVar("_Right")  # what may stand at its left
-_Test = TypeVar("_Test")  # the type of a comparison
+_Left = TypeVar("_Left")  # right operands with which the array is the left operand and gives the type of the result
+_Right = TypeVar("_Right")  # left operands with which the array is the right operand and gives the type of the result
+_Test = TypeVar("_Test")  # result of a comparison
 
 class _Array(dr.ArrayBase, Generic[_Left, _Right, _Test]):
     def __init__(self, *values: Any) -> None: ...
@@ -104,7 +104,7 @@ class _MaskVector(dr.ArrayBase):
 _Item = TypeVar("_Item")
 
 class _Vector(_Array[_Left, _Right, _MaskVector], Generic[_Left, _Right, _Item]):
-    """Points, vectors and normals turn into each other by themselves, and so are one type here."""
+    """Points, vectors and normals convert to each other implicitly, and are one type here."""
 
     x: _Item
     y: _Item
@@ -204,7 +204,7 @@ class ScalarVector3u(
     z: int
 
 class Spectrum(_Vector[Spectrum | _Number, Spectrum | _Number, Float]):
-    """An array of its own, of three colours here: of how many, and of what, differs by variant."""
+    """A class apart from `Color3f`, as in spectral variants."""
 
 UnpolarizedSpectrum = Spectrum
 
@@ -288,7 +288,7 @@ def has_flag(flags: int, flag: int) -> bool: ...
 def has_flag(flags: UInt32, flag: int) -> Bool: ...
 
 class SceneParameters(Mapping[str, Any]):
-    """The values are of the types of the scene's parameters."""
+    """The type of a value depends on the key."""
 
     properties: Any
     hierarchy: Any
@@ -990,8 +990,6 @@ class DirectionSample3f(PositionSample3f):
     def __init__(self) -> None: ...
     @overload
     def __init__(self, other: PositionSample3f) -> None: ...
-    @overload
-    def __init__(self, other: DirectionSample3f) -> None: ...
     @overload
     def __init__(
         self,

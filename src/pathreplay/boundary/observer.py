@@ -213,7 +213,7 @@ class ObserverVertex:
     def medium(self, d: mi.Vector3f) -> mi.MediumPtr | None:
         """Return the medium in direction ``d``; None in scenes without media."""
         if self.trace.media is None:
-            return None  # type: ignore[return-value]  # as in `Arrival`
+            return None  # as in `Arrival`
         turns = self.vertex.surface & self.si.is_medium_transition()
         return dr.select(turns, self.si.target_medium(d), self.at.medium)
 

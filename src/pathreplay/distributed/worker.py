@@ -115,7 +115,7 @@ class RayActor:
 def _capture_log() -> Log:
     """Collect Mitsuba's log in memory, since nobody reads the terminal of an actor."""
 
-    class LogBuffer(mi.Appender):  # type: ignore[misc]  # defined here, since the base class depends on the variant
+    class LogBuffer(mi.Appender):  # defined here, since the base class depends on the variant
         def __init__(self) -> None:
             super().__init__()
             self.lines: list[str] = []

@@ -65,7 +65,7 @@ def on_base(template: type, base: type) -> type:
     """
     parts = [vars(part) for part in reversed(template.__mro__[:-1])]
     body = {name: value for part in parts for name, value in part.items() if name not in ("__dict__", "__weakref__")}
-    return type(base)(template.__name__, (base,), body)  # type: ignore[no-any-return]
+    return type(base)(template.__name__, (base,), body)
 
 
 def _register_stand_ins(variant: str, plugins: Plugins) -> None:

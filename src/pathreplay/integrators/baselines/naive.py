@@ -50,7 +50,7 @@ def _cut(state: tuple[Any, ...]) -> Any:
     Otherwise the reverse pass is a single kernel whose size grows with depth: at 64 vertices it compiles for a minute.
     """
 
-    class Cut(dr.CustomOp):  # type: ignore[misc]
+    class Cut(dr.CustomOp):
         def eval(self, state: tuple[dr.ArrayBase, ...]) -> tuple[dr.ArrayBase, ...]:
             return tuple(type(value)(value) for value in state)
 
