@@ -11,9 +11,6 @@ and Jakob (2021). It serves as a baseline for comparison: the sweep driver needs
 
 from __future__ import annotations
 
-from functools import reduce
-from operator import add
-
 import drjit as dr
 import mitsuba as mi
 
@@ -53,7 +50,7 @@ def replay_attached(
             dr.eval(q, L, overflow)  # else each entry of the camera matrix runs the first pass again
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
-            backward(reduce(add, (q0[k] * x[k] for k in range(4))))
+            backward(sum((q0[k] * x[k] for k in range(1, 4)), q0[0] * x[0]))
     _peel(trace, again, path, PeeledPath(δL, L, q, overflow), lost, recovery, scale)
 
 

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.plugins.supergrid import Bounds
-from pathreplay.samplers.sampler import Sampler
 
 T = TypeVar("T")
 

@@ -31,7 +31,6 @@ from pathreplay.plugins.supergrid import (
     mean_chord,
     voxel_bounds,
 )
-from pathreplay.samplers.sampler import Sampler
 
 #: Half extent of a constant density given as a number: larger than any scene, and far from overflow. (A `constvolume`
 #: by default fills the unit cube only.)
