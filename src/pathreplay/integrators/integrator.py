@@ -234,11 +234,13 @@ class PathReplayIntegrator(PathIntegrator):
             self._learned(view, trace, state)
             result = self.interior.pixels(view, trace, loss, some)
             if edges:
+                assert result.image is not None
                 grad_in = offset + slope * result.image
                 if some is not None:
                     grad_in = scatter_rows(some, grad_in, view.size)
                 result = reduce(add, [term.backward(view, trace, grad_in, None) for term in edges], result)
         self._log_notes(view, trace, result)
+        assert result.image is not None
         return result.image, state.after(result)
 
     def begin(self, scene: mi.Scene) -> PassState:
@@ -302,7 +304,7 @@ class PathReplayIntegrator(PathIntegrator):
             self.warned.add(message)
             mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Json:
         """Return the properties of this integrator, except the ones that all path integrators share."""
         return {
             "adjoint": "auto" if self.interior.auto else self.adjoint,

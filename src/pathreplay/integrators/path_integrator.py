@@ -36,7 +36,7 @@ from pathreplay.types import Json
 UNBOUNDED = 0xFFFFFFFF
 
 
-def _sum(total: Any, image: Any, share: float) -> Any:
+def _sum(total: mi.TensorXf | None, image: mi.TensorXf, share: float) -> mi.TensorXf:
     """Add a weighted image of a split pass to the sum, evaluated before the next pass begins."""
     if share == 1:
         return image
@@ -75,7 +75,7 @@ class PathIntegrator:
     attach = "none"
     uses_sobol = False  # Owen-scrambled Sobol samples replace independent ones
     boundary = "none"  # estimated boundary terms
-    baseline: Any = None  # learned state
+    baseline: object = None  # learned state
     interior: Term
     max_depth: int  # this and the following are members of Mitsuba's integrator
     rr_depth: int
@@ -133,9 +133,11 @@ class PathIntegrator:
                 if part.flow is not None:
                     part.flow.carry_tangents()
                 result = reduce(add, [term.forward(part, trace, learned) for term in terms])
+                assert result.image is not None
                 tangent = _sum(tangent, result.image, part.share)
             self._log_notes(part, trace, result)
             self.keep(scene, state.after(result))
+        assert tangent is not None
         return tangent
 
     def render_backward(
@@ -158,6 +160,7 @@ class PathIntegrator:
         for part in parts(view):
             with self._pass_context():
                 total = _sum(total, image(part, self._walk(part.scene, part.sensor, state)), part.share)
+        assert total is not None
         return total
 
     def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState:
@@ -178,8 +181,14 @@ class PathIntegrator:
         return state
 
     def sample(
-        self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
-    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], Any]:
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        active: mi.Bool | bool = True,
+        **_: object,
+    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], None]:
         """Estimate radiance along rays that start outside of media, for callers without a sensor (Mitsuba's `aov`).
 
         Only the primal mode is supported; `render_forward` and `render_backward` differentiate. Raises PathreplayError

@@ -8,6 +8,8 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError, shown
 
+T = TypeVar("T")
+
 #: Largest integer that Mitsuba's integrators can store.
 LARGEST = 2**31 - 1
 

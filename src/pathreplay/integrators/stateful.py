@@ -66,7 +66,7 @@ class StatefulIntegrator(Protocol):
 
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None: ...
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Json:
         """Return the properties for an equivalent `pathreplay`, except the ones that all path integrators share."""
 
 

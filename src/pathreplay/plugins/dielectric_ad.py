@@ -29,7 +29,7 @@ MAX_REFLECTION = 0.75
 TINTS = ("specular_reflectance", "specular_transmittance")
 
 
-def _index(props: Any, name: str, default: str) -> float:
+def _index(props: mi.Properties, name: str, default: str) -> float:
     """Read an index of refraction: a number, or the name of a material in Mitsuba's table."""
     if name in props and props.type(name) == mi.Properties.Type.Integer:
         ior = float(props[name])

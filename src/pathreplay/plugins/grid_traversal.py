@@ -51,7 +51,7 @@ class Cells:
     def is_single(self) -> bool:
         return self.shape == (3, 3, 3)
 
-    def lookup(self, kind: Any, cell: mi.Vector3f, active: mi.Bool) -> Any:
+    def lookup(self, kind: type[T], cell: mi.Vector3f, active: mi.Bool) -> T:
         """Return the values of a cell (Vector3f of integers) as a Float or a vector."""
         index = mi.UInt32(dr.fma(dr.fma(cell.z, self.shape[1], cell.y), self.shape[0], cell.x))
         return dr.gather(kind, self.table, index, active)
@@ -77,7 +77,7 @@ def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
 # ---------------------------------------------------- traversal ----------------------------------------------------
 
 
-def through(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
+def through(box: mi.ScalarBoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
     """Return the distances at which the line of a ray enters and leaves a box; the first is larger on a miss. Attached.
 
     Mitsuba's `BoundingBox.ray_intersect` does the same, but accepts only rays of the first variant set in the process.
@@ -95,7 +95,7 @@ def through(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
     return near, far
 
 
-def clip(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
+def clip(box: mi.ScalarBoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
     """Return the part [a, b] of a ray inside a box, or a = 0, b = -1 on a miss. Never NaN for a finite ray."""
     near, far = through(box, ray)
     a, b = dr.fmax(near, 0), dr.fmin(far, ray.maxt)
@@ -215,7 +215,14 @@ def _scaled(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
 
 
 @dr.syntax
-def transmittance(cells: Cells, box: Any, ray: Any, density: Callable[..., Any], sampler: Any, active: Any) -> Any:
+def transmittance(
+    cells: Cells,
+    box: mi.ScalarBoundingBox3f,
+    ray: mi.Ray3f,
+    density: Callable[[mi.Float, mi.Bool], mi.Spectrum],
+    sampler: mi.Sampler,
+    active: mi.Bool | bool,
+) -> mi.Spectrum:
     """Estimate exp(-∫ σ ds) along the ray per channel (UnpolarizedSpectrum) without bias: residual ratio tracking.
 
     With control density c and rate m per cell (Novák et al. 2014), T = exp(-∫ c ds) Π (1 - (σ - c)/m), the product over

@@ -95,7 +95,7 @@ class GridMedium:
         self.majorant = mi.Float(majorants[-1][0])
         dr.make_opaque(self.majorant)
 
-    def _cheapest_cells(self, values: list[tuple[Any, ...]]) -> grid_traversal.Cells:
+    def _cheapest_cells(self, values: Sequence[tuple[mi.Float, ...]]) -> grid_traversal.Cells:
         """Return cells of the cheapest level; ``values`` has one tuple per level, with the collision rate last."""
         rates = [dr.mean(numbers[-1]) for numbers in values]
         dr.eval(values, rates)
@@ -137,7 +137,7 @@ class GridMedium:
 
     # ------------------------------------------ interface of pathreplay ------------------------------------------
 
-    def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool = True) -> tuple[mi.Float, mi.Float]:
+    def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool | bool = True) -> tuple[mi.Float, mi.Float]:
         """Sample the distance to the next tentative collision, and return it with the local majorant. Detached.
 
         The distance t solves ∫_0^t m ds = -log(1 - u). The local majorant m is at least σ_t in all channels, and 0
@@ -147,7 +147,9 @@ class GridMedium:
         with dr.suspend_grad():
             return grid_traversal.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
 
-    def transmittance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+    def transmittance(
+        self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool | bool = True
+    ) -> mi.UnpolarizedSpectrum:
         """Estimate exp(-∫_0^{ray.maxt} σ_t ds) per channel without bias. Detached."""
         with dr.suspend_grad():
             ray, scale = dr.detach(ray), dr.detach(self.scale)
@@ -159,7 +161,7 @@ class GridMedium:
 
             return grid_traversal.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
 
-    def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+    def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool | bool = True) -> mi.UnpolarizedSpectrum:
         """Return the radiance emitted per unit length at an interaction; 0 without emission."""
         return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
 
@@ -167,7 +169,7 @@ class GridMedium:
 # ---------------------------------------------- reading the properties ----------------------------------------------
 
 
-def _volume(props: Any, name: str, default: float | None) -> Any:
+def _volume(props: mi.Properties, name: str, default: float | None) -> Any:
     """Read the volume of that name, or None. Textures, colours and numbers become a very large `constvolume`."""
     value = props[name] if name in props else default
     if value is None or isinstance(value, mi.Volume):

@@ -138,7 +138,8 @@ def _bounds(to_cell: NDArray[np.float64], values: Values) -> Bounds:
 
 def coarser(bounds: Bounds) -> Bounds:
     """Merge the bounds into cells that are twice as large along every axis."""
-    values: Any = [mi.TensorXf(v, bounds.shape[::-1]) for v in (bounds.lowest, bounds.mean, bounds.highest)]
+    shape = bounds.shape[::-1]
+    values = mi.TensorXf(bounds.lowest, shape), mi.TensorXf(bounds.mean, shape), mi.TensorXf(bounds.highest, shape)
     for axis, n in enumerate(bounds.shape):
         pairs = np.minimum(np.arange(0, n, 2)[:, None] + [0, 1], n - 1)
         values = _merged(values, axis, pairs, pairs)
@@ -214,7 +215,7 @@ def cheapest(levels: list[Bounds], rates: list[float], chord: float) -> int:
     return int(np.argmin(costs))
 
 
-def mean_chord(box: mi.BoundingBox3f) -> float:
+def mean_chord(box: mi.ScalarBoundingBox3f) -> float:
     """Return the mean length of a random line in a box: four times the volume over the surface area (Cauchy)."""
     x, y, z = (float(e) for e in box.extents())
     return 0.0 if x * y * z == 0 else 2 * x * y * z / (x * y + y * z + z * x)

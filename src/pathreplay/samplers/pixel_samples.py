@@ -21,10 +21,10 @@ class PixelSamples(Protocol):
     def together(self, paths: int) -> int:
         """Return the number of paths per set, for ``paths`` paths in total."""
 
-    def first(self) -> Any:
+    def first(self) -> Sampler:
         """Return the sampler of the first path."""
 
-    def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
+    def of(self, before: Sampler, place: mi.UInt32, size: int, number: mi.UInt32) -> Sampler:
         """Return the sampler of the path at index ``place`` in set ``number``, which has ``size`` paths.
 
         ``before`` is the sampler of the previous path.
@@ -54,7 +54,7 @@ class IndependentSets:
 class SobolSets:
     """Low-discrepancy samples, in up to `SETS` sets."""
 
-    sampler: Callable[[mi.UInt32, int, mi.UInt32], Any]
+    sampler: Callable[[mi.UInt32, int, mi.UInt32], Sampler]
     """Maps index in the set, size of the set and index of the set to a sampler."""
 
     def together(self, paths: int) -> int:

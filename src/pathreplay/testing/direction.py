@@ -38,7 +38,7 @@ class Line:
     step: float
     stencil: Stencil
 
-    def move(self, value: Any, t: mi.Float) -> Any:
+    def move(self, value: SceneValue, t: mi.Float) -> SceneValue:
         """Return the point at t, computed from the parameter's own ``value`` and of the same type."""
         return displaced(value, self.direction, t)
 

@@ -97,7 +97,7 @@ def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: 
     return f"{output}: {len(results)} items, {len(wrong)} failed" + (f" ({'; '.join(wrong)})" if wrong else "")
 
 
-def _summary(facts: dict[str, Any]) -> str:
+def _summary(facts: Json) -> str:
     if "verdict" in facts:
         return f"{facts['verdict']} (z = {facts['z']:+.1f})"
     return f"{facts['seconds']:.4f} s"
@@ -128,7 +128,7 @@ def truth(name: str) -> Json:
     return facts | {"z": check.z if math.isfinite(check.z) else 0.0}
 
 
-def timing(name: str) -> dict[str, Any]:
+def timing(name: str) -> Json:
     """Time gradient passes: return seconds of the first pass, and median and minimum of the others."""
     import drjit as dr
     import mitsuba as mi

@@ -24,7 +24,7 @@ class Gap(NamedTuple):
     z: Numbers
 
 
-def mean_and_error(samples: ArrayLike) -> tuple[Any, Any]:
+def mean_and_error(samples: ArrayLike) -> tuple[Numbers, Numbers]:
     """Return the mean of independent samples and its standard error."""
     samples = np.asarray(samples, np.float64)
     return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
@@ -39,7 +39,7 @@ def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
     return Gap(difference, σ, welch(difference, σ, (error_a, len(a)), *([] if known else [(error_b, len(b))])))
 
 
-def welch(difference: Any, σ: Any, *parts: tuple[Any, int]) -> Any:
+def welch(difference: Numbers, σ: Numbers, *parts: tuple[Numbers, int]) -> Numbers:
     """Convert difference/σ to z, where ``parts`` (standard error, number of samples) are estimated contributions to σ.
 
     The remaining contributions to σ are known and add no uncertainty to it (Welch-Satterthwaite).
@@ -52,6 +52,6 @@ def welch(difference: Any, σ: Any, *parts: tuple[Any, int]) -> Any:
     return np.copysign(np.maximum(z, 0), difference)[()]
 
 
-def normal(t: Any, freedom: Any) -> Any:
+def normal(t: Numbers, freedom: Numbers) -> Numbers:
     """Return the normal deviate with the same tail probability as a ratio t >= 0 under Student's distribution."""
     return stats.norm.isf(np.maximum(stats.t.sf(t, freedom), 1e-300))

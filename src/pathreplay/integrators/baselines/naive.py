@@ -44,7 +44,7 @@ def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter)
         return tangents(L)[0], valid, moves
 
 
-def _cut(state: tuple[Any, ...]) -> Any:
+def _cut(state: T) -> T:
     """Return the same values, and make AD passes evaluate their derivatives at this point.
 
     Otherwise the reverse pass is a single kernel whose size grows with depth: at 64 vertices it compiles for a minute.

@@ -80,9 +80,8 @@ class FilmMotion:
         with dr.resume_grad():
             (δ,) = tangents(self._flow_factor(view, f))
         pixels = places.pixels(f.pixel, f.L * δ, f.wavelengths)
-        pixels += blurred(
-            sum(places.pixels(i, f.L * δ * factor, f.wavelengths) for i, factor in self._smooth_factors(view, f))
-        )
+        shifted = (places.pixels(i, f.L * δ * factor, f.wavelengths) for i, factor in self._smooth_factors(view, f))
+        pixels += blurred(reduce(add, shifted))
         return TermResult(places.developed(pixels))
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
