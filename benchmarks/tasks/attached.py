@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..measures.job import Job, Point, Record
-from ..tables import comparison, groups, markdown, method_cell
+from ..tables import groups, markdown, method_cell, time_cells
 
 TITLE = "attached"
 TAKES = (12, 75)
@@ -54,7 +54,7 @@ def table(record: Record) -> str:
     """Time next to `prb`, which leaves out most of this gradient; then peak memory."""
     timed = [point for point in record.points if point.scene == SCENE]
     rows = [
-        [", ".join(p.parameters), str(p.max_depth), method_cell(p), *comparison(p, methods.get("prb"))[:2]]
+        [", ".join(p.parameters), str(p.max_depth), method_cell(p), *time_cells(p, methods.get("prb"))]
         for methods in groups(timed).values()
         for p in methods.values()
     ]

@@ -16,7 +16,7 @@ from dataclasses import replace
 from ..measures.estimates import mean_ratio
 from ..measures.job import Job, Point, Record
 from ..measures.methods import DIFFERENCE, RECORDED, TRACED
-from ..tables import comparison, markdown, method_cell
+from ..tables import comparison, markdown, method_cell, time_cells
 
 TITLE = "edges"
 TAKES = (60, 900)
@@ -103,7 +103,7 @@ def table(record: Record) -> str:
     Last, derivatives by one number next to central differences.
     """
     found = by_job([point for point in timed(record) if ", " not in point.method])
-    rows = [[p.scene, method_cell(p), *_versus(p, job.get("prb"))[:2]] for job in found for p in job.values()]
+    rows = [[p.scene, method_cell(p), *_times(p, job.get("prb"))] for job in found for p in job.values()]
     header = ["scene", "method", "seconds of kernels (median)", "time / prb"]
     steps = {point.method: point for point in timed(record) if ", " in point.method}
     return "\n\n".join((costs(found), markdown(header, rows), _steps(steps), worth(record)))
@@ -157,9 +157,9 @@ def costs(found: list[dict[str, Point]]) -> str:
         least = min((point.paths for job in jobs for point in job.values()), default=0)
         large = {name: job for job in jobs for name, point in job.items() if point.paths > least}
         at = {name: job for job in jobs for name, point in job.items() if point.paths == least}
-        times = [_versus(at[name][name], at[name].get("prb"))[1] if name in at else "" for name in timed]
+        times = [_times(at[name][name], at[name].get("prb"))[1] if name in at else "" for name in timed]
         times.append(
-            _versus(large["boundary alone"]["boundary alone"], large["boundary alone"]["prb"])[1] if large else ""
+            _times(large["boundary alone"]["boundary alone"], large["boundary alone"]["prb"])[1] if large else ""
         )
         rows.append(
             [scene, *times, *(_cost(at.get(ours), ours, at.get(baseline), baseline) for ours, baseline in VERSUS)]
@@ -167,13 +167,18 @@ def costs(found: list[dict[str, Point]]) -> str:
     return markdown(header, rows)
 
 
-def _versus(point: Point, baseline: Point | None) -> list[str]:
-    """As `comparison`, of the rounds that both have: one may have sat out the last."""
-    if baseline is None or baseline is point:
-        return comparison(point, baseline)
+def _times(point: Point, baseline: Point | None) -> list[str]:
+    """As `time_cells`, of the rounds that both have: one may have sat out the last."""
+    return time_cells(point, baseline) if baseline is None or baseline is point else time_cells(*_both(point, baseline))
+
+
+def _both(point: Point, baseline: Point) -> tuple[Point, Point]:
+    """Two points with the rounds that both have."""
     n = min(len(point.seeds), len(baseline.seeds))
-    first = [replace(p, seconds=p.seconds[:n], squared_errors=p.squared_errors[:n]) for p in (point, baseline)]
-    return comparison(*first)
+    point, baseline = (
+        replace(p, seconds=p.seconds[:n], squared_errors=p.squared_errors[:n]) for p in (point, baseline)
+    )
+    return point, baseline
 
 
 def _cost(job: dict[str, Point] | None, ours: str, other: dict[str, Point] | None, baseline: str) -> str:
@@ -182,7 +187,7 @@ def _cost(job: dict[str, Point] | None, ours: str, other: dict[str, Point] | Non
         return ""
     seconds = [st.median(x["prb"].seconds) if "prb" in x and x["prb"].seconds else 1.0 for x in (job, other)]
     scaled = tuple(s * seconds[0] / seconds[1] for s in other[baseline].seconds)
-    return _versus(job[ours], replace(other[baseline], seconds=scaled))[3]
+    return comparison(*_both(job[ours], replace(other[baseline], seconds=scaled)))[3]
 
 
 def _steps(steps: dict[str, Point]) -> str:
