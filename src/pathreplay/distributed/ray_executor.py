@@ -42,7 +42,7 @@ LOOK_S, AGAIN_S = 0.1, 1.0
 """Seconds without an answer after which the processes of the cluster, and its head, are checked."""
 
 Reference = Hashable
-"""Of Ray, to an answer or to arrays in its object store."""
+"""Ray's reference to an answer, or to arrays in its object store."""
 
 Tell = Callable[[str], None]
 

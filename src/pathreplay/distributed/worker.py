@@ -63,7 +63,7 @@ def versions() -> str:
 
 
 class Log(Protocol):
-    """The lines that Mitsuba logged."""
+    """Holds the lines that Mitsuba has logged."""
 
     lines: list[str]
 

@@ -1,4 +1,4 @@
-"""What paths ask of their source of random numbers."""
+"""The interface that light paths require of a sampler."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ S = TypeVar("S")
 
 
 class Sampler(Protocol):
-    """A source of random numbers in [0, 1): a sampler of Mitsuba or one of this package."""
+    """Gives random numbers in [0, 1): a sampler of Mitsuba or of this package."""
 
     def clone(self: S) -> S: ...
 

@@ -110,7 +110,7 @@ def vol_bytes(data: np.ndarray, bounds: Bounds = UNIT_CUBE) -> bytes:
 
 
 def vol_bounds(vol: bytes) -> Bounds:
-    """The box that the grid of a `.vol` file fills if `use_grid_bbox` is set."""
+    """Return the box that the grid of a `.vol` file fills if `use_grid_bbox` is set."""
     x, y, z, X, Y, Z = _VOL_HEADER.unpack_from(vol)[6:]
     return (x, y, z), (X, Y, Z)
 

@@ -44,7 +44,7 @@ def _contents(node: mi.Object) -> tuple[list[tuple[str, mi.Object]], list[tuple[
 
 
 def is_mesh(shape: mi.Shape) -> TypeIs[mi.Mesh]:
-    """Whether a shape is a mesh, for type checkers too."""
+    """Check whether a shape is a mesh, and narrow its type."""
     return shape.is_mesh()
 
 
