@@ -127,7 +127,8 @@ def test_a_sky_goes_through_a_job_column_by_column(folder: Path) -> None:
     assert saved["env.data"].shape == SKY.shape
     assert json.loads((result.folder / "parameters.json").read_text())["env.data"]["shape"] == [4, 8, 3]
     assert "8 x 4 texels" in result.report.read_text()
-    assert PIL.Image.open(result.folder / "images/texture-result-env.data.png").size == (8, 4)
+    with PIL.Image.open(result.folder / "images/texture-result-env.data.png") as picture:
+        assert picture.size == (8, 4)
     # What is saved is what was rendered: a scene with that sky shows the result.
     (folder / "sky.exr").write_bytes(exr_bytes(saved["env.data"]))
     again = optimize(make_config({**JOB, "parameters": [{"key": "env.data"}], "iterations": 1}), progress=False)
