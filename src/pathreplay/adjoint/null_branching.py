@@ -53,7 +53,7 @@ class Branch:
         return replace(dr.select(taken, offered, self), mass=mass, number=number)
 
 
-def branch_backward(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum) -> None:
+def branch_backward(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ray3f, δL: mi.Spectrum) -> None:
     """Back-propagate ``δL`` through the branch's contribution to the radiance, if a parameter reaches it."""
     with dr.resume_grad():
         term = branch_term(trace, branch, sampler, ray)
@@ -61,7 +61,7 @@ def branch_backward(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray
             backward(dr.sum(δL * term))
 
 
-def branch_term(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.Spectrum:
+def branch_term(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ray3f) -> mi.Spectrum:
     """Return a term whose derivative is the branch's contribution to the derivative of the radiance (Spectrum).
 
     The value of the term has no meaning. The extra path is detached; time and wavelengths are those of the camera

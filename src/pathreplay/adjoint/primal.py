@@ -26,7 +26,7 @@ def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool
 
 
 @dr.syntax
-def walk_on(trace: TraceConfig, sampler: mi.Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
+def walk_on(trace: TraceConfig, sampler: Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
     """Continue a path from its present state; return the radiance that arrives along it, and whether it met anything.
 
     The throughput of the path must be one: the radiance is relative to it.

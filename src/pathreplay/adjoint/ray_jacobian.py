@@ -182,7 +182,7 @@ def linearise(
     return Linearised(mi.Matrix4f(*A), δe, log_w, slope, frame_next)
 
 
-def _unit_tangent(value: mi.Float) -> mi.Float:
+def _unit_tangent(value: mi.Float | float) -> mi.Float:
     """Create an independent AD variable with tangent 1, also where gradients are suspended.
 
     Gradients must be resumed for this variable only: virtual calls would otherwise propagate tangents of parameters

@@ -171,13 +171,13 @@ for _place, *_, _remembered in (*FIELDS, *BITS):  # after a rename, fail on impo
 
 
 @cache
-def record_type(layout: Layout) -> type:
+def record_type(layout: Layout) -> type[object]:
     """Return the dataclass of a recorded vertex."""
     kept = {_name(place): _plain(kind) for place, kind, remembered in FIELDS if getattr(layout, remembered)}
     return make_dataclass("Record", [*kept.items(), ("word", mi.UInt32)])
 
 
-def record(layout: Layout, v: VertexRecord) -> Any:
+def record(layout: Layout, v: VertexRecord) -> object:
     """Convert a vertex to its record."""
     kept = {}
     for place, kind, remembered in FIELDS:
@@ -192,7 +192,9 @@ def record(layout: Layout, v: VertexRecord) -> Any:
     return make(**kept, word=word)
 
 
-def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, ray0: mi.Ray3f) -> VertexRecord:
+def read_back(
+    layout: Layout, records: dr.Local[object], index: mi.UInt32, last: mi.UInt32, ray0: mi.Ray3f
+) -> VertexRecord:
     """Read the vertex recorded at ``index``.
 
     ``last`` is the index of the path's last vertex; time and wavelengths are those of the ray ``ray0``.

@@ -26,7 +26,7 @@ def first_walk(
     records: dr.Local[object],
     first: mi.UInt32,
     lost: NonFiniteCounter,
-) -> tuple[Any, mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
+) -> tuple[dr.Local[object], mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
     """Record a path from index ``first`` on.
 
     Returns the records, their number, the radiance of the path, the radiance from beyond the last record (relative to

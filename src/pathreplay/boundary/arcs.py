@@ -89,10 +89,11 @@ class Arc:
     @dr.syntax
     def _density(self, active: mi.Bool) -> mi.Float:
         """Return the mean of p P_j over all possible positions of the sample."""
-        arc, i, total = self, mi.UInt32(0), mi.Float(0)
-        while dr.hint(i < POSITIONS, exclude=[arc, active], label="pathreplay: density of an arc"):
+        assert self.j is not None
+        arc, j, i, total = self, self.j, mi.UInt32(0), mi.Float(0)
+        while dr.hint(i < POSITIONS, exclude=[arc, j, active], label="pathreplay: density of an arc"):
             p = density_of_samples(arc.observer.towards(arc.at(_position(i) * arc.length), active)[1])
-            total += p * probability(p, arc.j) / POSITIONS
+            total += p * probability(p, j) / POSITIONS
             i += 1
         return total
 

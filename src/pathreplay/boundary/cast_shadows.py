@@ -55,7 +55,7 @@ def cast_shadows(
 
 def _point(shape: mi.Shape, u_face: mi.Float, u: mi.Point2f) -> mi.Point3f:
     """Sample a point on a shape; on a mesh, all triangles are equally likely."""
-    if not shape.is_mesh():
+    if not is_mesh(shape):
         return shape.sample_position(0, u).p
     n = shape.face_count()
     corners = shape.face_indices(dr.minimum(mi.UInt32(u_face * n), n - 1))

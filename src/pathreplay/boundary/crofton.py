@@ -59,7 +59,7 @@ class VisibilityProbe:
     lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the BSDF sample, or zero
 
     @staticmethod
-    def of(signature: int | mi.UInt32 = 0) -> VisibilityProbe:
+    def of(signature: int | mi.UInt32 | mi.Bool = 0) -> VisibilityProbe:
         """Create a probe that consists of a signature only."""
         return VisibilityProbe(mi.UInt32(signature), mi.Point3f(0), mi.Normal3f(0))
 

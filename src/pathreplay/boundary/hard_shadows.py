@@ -29,7 +29,7 @@ class ShadowTest:
     hit: mi.PreliminaryIntersection3f
     outside: mi.Bool  # the point is outside a projector's image, or a cone without falloff
     uv: mi.Point2f  # position in the image
-    met: mi.PreliminaryIntersection3f = None  # hit of the point; None for a point in a medium
+    met: mi.PreliminaryIntersection3f | None = None  # hit of the point; None for a point in a medium
 
     @staticmethod
     def of(trace: TraceConfig, at: Arrival, sampler: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
@@ -80,6 +80,7 @@ class HardShadow:
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """Evaluate B. Differentiable in the ray, which slides over the surface, in the shapes and in the light."""
+        assert self.test.met is not None
         si = self.test.met.compute_surface_interaction(ray, mi.RayFlags.All, active & self.exists)
         return self.gap_at(si, active)
 

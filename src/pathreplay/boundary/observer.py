@@ -60,7 +60,7 @@ class SelectedVertex:
 
 @dr.syntax
 def choose_vertex(
-    trace: TraceConfig, sampler: CounterSampler, ray: mi.Ray3f, flows: mi.Bool, layout: Layout, records: Any
+    trace: TraceConfig, sampler: CounterSampler, ray: mi.Ray3f, flows: mi.Bool, layout: Layout | None, records: Any
 ) -> tuple[Any, SelectedVertex]:
     """Trace a camera path, and select one of its smoothly scattering vertices in proportion to the throughput.
 
@@ -210,7 +210,7 @@ class ObserverVertex:
         pairs = zip(rays, firsts, strict=True)
         return [dr.select(through, self.behind(ray, first, active), first) for ray, first in pairs], through
 
-    def medium(self, d: mi.Vector3f) -> mi.MediumPtr | None:
+    def medium(self, d: mi.Vector3f) -> mi.MediumPtr:
         """Return the medium in direction ``d``; None in scenes without media."""
         if self.trace.media is None:
             return None  # as in `Arrival`

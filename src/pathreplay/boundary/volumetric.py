@@ -130,7 +130,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
     ) -> tuple[EdgePath, ObserverVertex]:
         """Record the path through null boundaries to the medium point; return the path, and the point as observer."""
         trace, layout, τ = self.trace, Layout.of(self.trace, True), segment.τ
-        records: Any = dr.alloc_local(record_type(layout), room_for(trace))
+        records = dr.alloc_local(record_type(layout), room_for(trace))
         sampler = CounterSampler.of(segment.key)
         path = PathState.begin(trace, CameraStart(ray, sampler, active))
         at, flight = path.at, Flight.none(trace.media)

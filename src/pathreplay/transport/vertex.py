@@ -265,7 +265,7 @@ def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     return dr.select(dr.isfinite(weight), weight, 0)
 
 
-def reciprocal(x: mi.Float) -> mi.Float:
+def reciprocal(x: Real) -> Real:
     """Return 1/x where x is not zero, else zero."""
     return dr.select(x != 0, dr.rcp(x), 0)
 

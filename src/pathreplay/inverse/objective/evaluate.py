@@ -147,7 +147,7 @@ class Local:
             yield self.evaluate(values, shard, learned)
 
 
-def _taken(gradient: Any) -> Array:
+def _taken(gradient: dr.ArrayBase) -> Array:
     """Convert a gradient to NumPy; large grids share memory with Dr.Jit."""
     if dr.is_tensor_v(gradient) and dr.width(gradient) >= LARGE and dr.type_v(gradient) == dr.VarType.Float32:
         return gradient.numpy()
@@ -161,7 +161,7 @@ def release(values: Arrays) -> None:
     memory.require_kept()
 
 
-def owned_tensor(picture: Array) -> Any:
+def owned_tensor(picture: Array) -> mi.TensorXf:
     """Copy an image into memory that Dr.Jit owns: see `variables_of`."""
     tensor = mi.TensorXf(np.ascontiguousarray(picture)) * dr.opaque(mi.Float, 1)
     dr.eval(tensor)
@@ -193,7 +193,7 @@ class Evaluator:
         # By view, samples per pixel, and whether pixels are batched: whether a pixel sweep is possible.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
         self._learned: Arrays = {}  # state of the integrator after the last evaluation
-        self._at: Any = None  # the same state in the integrator, which another evaluator may have replaced
+        self._at: object = None  # the same state in the integrator, which another evaluator may have replaced
         self._begun = False
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
@@ -250,7 +250,7 @@ class Evaluator:
 
     def _differentiated(
         self, view: int, seed: int, spp: int, factor: Array | None, batch: Batch | None
-    ) -> tuple[float, Any]:
+    ) -> tuple[float, mi.TensorXf | None]:
         """Return the view's contribution to the loss, and the derivative with respect to its ``factor``.
 
         Gradients of the scene's parameters are accumulated in the parameters.
@@ -259,7 +259,8 @@ class Evaluator:
         sensor, picture, counts = about.sensor, about.target, about.weight
         if batch is not None:
             picture, counts = batch.rows(picture), None if counts is None else batch.rows(counts)
-        target = ViewTarget(*(None if part is None else owned_tensor(part) for part in (picture, counts, factor)))
+        others = (None if part is None else owned_tensor(part) for part in (counts, factor))
+        target = ViewTarget(owned_tensor(picture), *others)
         # The first call is not recorded, because scenes create some parts when they are first rendered.
         which = view, spp, batch is not None
         records = self.freezes and which in self._sweeps
@@ -269,7 +270,7 @@ class Evaluator:
                 raise refused(about.name, why)
             self._sweeps[which] = not why and view in self._reached
         # Seeds are inputs of recorded passes. Traced passes use plain integers, which need not be read back.
-        number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
+        number = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         request = RenderRequest(sensor, number, spp, batch)
         loss = ViewLoss(problem.loss, about.share / len(problem.trained()), self._sweeps[which])
         problem.disk.rest()

@@ -94,8 +94,8 @@ class Recordings:
     """Frozen versions of `differentiate`, by view, shapes of the parameters, and constants of the kernels."""
 
     def __init__(self) -> None:
-        self._frozen: dict[Any, Callable[..., Any]] = {}
-        self._made: Counter[Any] = Counter()  # recordings by view and shapes
+        self._frozen: dict[Hashable, Callable[..., ViewResult]] = {}
+        self._made: Counter[Hashable] = Counter()  # recordings by view and shapes
 
     def differentiate(
         self,
@@ -125,7 +125,7 @@ class Recordings:
             raise NotRecordable from error
 
 
-def _recording(keys: list[str]) -> Callable[..., Any]:
+def _recording(keys: list[str]) -> Callable[..., ViewResult]:
     """Return `differentiate` as a frozen function that references neither scene nor problem."""
 
     def frozen(scene: mi.Scene, *args: Any) -> ViewResult:
@@ -188,14 +188,16 @@ def _times(tensor: mi.TensorXf, factor: mi.TensorXf | None) -> mi.TensorXf:
     return tensor if factor is None else tensor * factor
 
 
-def linear_derivative(loss: Loss, target: Any, weight: Any = None) -> tuple[Any, Any]:
+def linear_derivative(
+    loss: Loss, target: mi.TensorXf, weight: mi.TensorXf | None = None
+) -> tuple[mi.TensorXf, mi.TensorXf]:
     """Return offset and slope of the derivative of a quadratic loss with respect to the image."""
     bright = 1 + dr.abs(target)
     offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target, weight)
     return offset, (_derivative(loss, mi.TensorXf(bright), target, weight) - offset) / bright
 
 
-def _derivative(loss: Loss, image: Any, target: Any, weight: Any) -> Any:
+def _derivative(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weight: mi.TensorXf | None) -> mi.TensorXf:
     """Return the derivative of a loss with respect to the image."""
     dr.enable_grad(image)
     dr.backward(mean_loss(loss, image, target, weight))

@@ -138,7 +138,7 @@ def tables_of(
     )
 
 
-def _array(kind: type, values: Any) -> Any:
+def _array(kind: type[A], values: ArrayLike) -> A:
     """Create an array of these values.
 
     `dr.freeze` does not know host arrays that are created while it records. There the recording writes the array

@@ -183,6 +183,7 @@ def fly_again(
     σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
     σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
     if trace.branch:  # null collisions estimate the rest of the derivative at fixed position
+        assert trace.branching is not None
         rest = 1 - flight.p * branch_weight(flight.p, trace.branching)
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
         σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))

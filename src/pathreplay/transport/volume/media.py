@@ -136,6 +136,6 @@ def majorant(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
     return dr.max(dr.detach(medium.get_majorant(interaction(medium, dr.detach(ray), mi.Float(0)), active)))
 
 
-def is_grid(grid: mi.Medium, medium: mi.MediumPtr) -> mi.Bool:
+def is_grid(grid: Grid, medium: mi.MediumPtr) -> mi.Bool:
     """Return the lanes whose medium is this grid."""
     return medium == mi.MediumPtr(grid)
