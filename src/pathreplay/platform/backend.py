@@ -31,7 +31,7 @@ def point_drjit() -> None:
     if "drjit" in sys.modules:
         path = None if loaded_is_plausible() else _untried_choice()
         if path is not None and not reload_llvm(path) and not loaded_version():
-            logger.warning("drjit was imported before pathreplay and found no libLLVM: %s", _way_out(path))
+            logger.warning("drjit was imported before pathreplay and found no libLLVM: %s", _remedy(path))
         return
     asked_for = os.environ.get(ENVIRONMENT_VARIABLE, "")
     problem = _known_problem(asked_for) if asked_for else ""
@@ -50,7 +50,7 @@ def _known_problem(path: str) -> str:
     return _preload([*llvm.unlinked_siblings(path), path])
 
 
-def _way_out(path: str | None) -> str:
+def _remedy(path: str | None) -> str:
     if path is None:
         return llvm.WAY_OUT
     return f"import pathreplay before mitsuba, or start Python with {ENVIRONMENT_VARIABLE}={path}"
@@ -119,7 +119,7 @@ def warn_of_bad_llvm() -> None:
     if not loaded_is_plausible():
         logger.warning(
             "Dr.Jit has loaded libLLVM %s, which aborts the process at the first minimum or maximum: %s",
-            ".".join(map(str, loaded_version())), _way_out(_untried_choice()),
+            ".".join(map(str, loaded_version())), _remedy(_untried_choice()),
         )  # fmt: skip
 
 
