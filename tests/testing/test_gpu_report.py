@@ -47,7 +47,7 @@ def test_the_file_has_what_was_found_and_what_failed(tmp_path: Path, monkeypatch
 
 @pytest.mark.slow
 def test_items_run_in_processes_of_their_own(tmp_path: Path) -> None:
-    names = ("truth: colour of a wall", "time: sweep, 128 x 128, depth 8", "time: nothing")
+    names = ("truth: colour of a wall", "time: recorded, 128 x 128, depth 8", "time: nothing")
     line = examine("llvm_ad_rgb", tmp_path / "gpu.json", names, lambda line: None)
     truth, timing, none = json.loads((tmp_path / "gpu.json").read_text())["items"]
     assert truth["facts"]["verdict"] == "pass" and abs(truth["facts"]["z"]) < 4
