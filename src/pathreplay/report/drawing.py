@@ -36,6 +36,7 @@ def _import() -> None:
 _import()
 
 import matplotlib  # noqa: E402
+from matplotlib.axes import Axes as Axes  # noqa: E402
 from matplotlib.figure import Figure as Figure  # noqa: E402
 
 

@@ -12,13 +12,12 @@ from importlib.metadata import version
 import mitsuba as mi
 import numpy as np
 import PIL.Image
-from matplotlib.axes import Axes
 
 from pathreplay.inverse.images.io import Image, displayed, png_bytes, resized
 from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.inverse.parameters.grids import shown
 from pathreplay.inverse.parameters.pose import error_names
-from pathreplay.report.drawing import Figure, own_settings
+from pathreplay.report.drawing import Axes, Figure, own_settings
 from pathreplay.report.outcome import Contestant, Outcome, Recovered, ViewPictures, number_of
 from pathreplay.report.page_parts import (
     about,

@@ -9,6 +9,7 @@ import errno
 import mmap
 import os
 import tempfile
+import weakref
 from pathlib import Path
 from typing import IO
 
@@ -48,6 +49,7 @@ class DiskStore:
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(dir=_folder(), prefix="pathreplay-")
+                weakref.finalize(self, self._file.close)
             self._file.seek(begin)
             np.ascontiguousarray(array).tofile(self._file)
             self._file.flush()
