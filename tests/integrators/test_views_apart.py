@@ -114,6 +114,12 @@ def test_cameras_that_no_view_has_are_told_before_the_first_iteration(changes: d
     assert not (room / "run").exists()
 
 
+def test_the_only_stage_of_a_job_is_named_too() -> None:
+    job = {key: value for key, value in LEFT.items() if key != "iterations"}
+    with pytest.raises(PathreplayError, match=r"^stages: stage 1: 'left.to_world' reaches none"):
+        optimize(make_config({**job, "stages": [{"iterations": 2, "sensors": ["right"]}]}), progress=False)
+
+
 @pytest.mark.parametrize("first", [TEXTURE, None])
 def test_motion_that_is_not_differentiated_is_told_before_the_first_iteration(first: str | None, room: Path) -> None:  # noqa: F811
     moved = {"key": "wall.to_world", "pose": "translation"}

@@ -73,7 +73,7 @@ def require_kept() -> None:
 
 
 def require(needed: int, thing: str, remedy: str) -> None:
-    """Raise PathreplayError unless ``needed`` bytes are available; it names ``thing`` and the remedy ``remedy``."""
+    """Raise PathreplayError unless ``needed`` bytes are available; it names ``thing`` and the ``remedy``."""
     if needed > (left := available()):
         asked = f"needs about {_readable(needed)} of memory"
         raise PathreplayError(f"{thing} {asked}, {_readable(left)} is available; {remedy}")

@@ -26,9 +26,7 @@ def load_integrator(description: Mapping[str, object]) -> mi.Integrator:
     """Load the integrator that a dictionary describes. Raises PathreplayError if Mitsuba cannot create it."""
     require_values(description)
     name = description.get("type")
-    with errors_as(
-        f"Integrator '{name}' cannot be created", (Exception,)
-    ):  # plugins in Python raise exceptions of any type
+    with errors_as(f"Integrator '{name}' cannot be created", (Exception,)):  # Python plugins may raise anything
         integrator = mi.load_dict(dict(description))
     if not isinstance(integrator, mi.Integrator):
         raise PathreplayError(

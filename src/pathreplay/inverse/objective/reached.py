@@ -32,9 +32,8 @@ def require_reached(problem: Problem) -> None:
 
     Also raised if the integrator does not differentiate them.
     """
-    parts = parts_of(problem)
-    for part in parts:
-        where = f"stages: stage {part.number + 1}: " if len(parts) > 1 else ""
+    for part in parts_of(problem):
+        where = f"stages: stage {part.number + 1}: " if part.stage else ""
         views = part.problem.trained()
         reached = sorted(views.keys() & part.problem.reached(part.moving))
         if not reached and EXPOSURE not in part.moving:  # an exposure scales every image

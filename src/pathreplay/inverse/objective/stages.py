@@ -29,19 +29,23 @@ class Part:
     """The problem in one stage, or in the whole job if it has no stages."""
 
     number: int
+    stage: Stage | None
     problem: Problem
     """With the options of the stage, and the views that it trains on; their images are whole (see `scaled`)."""
     moving: frozenset[str]
     """Variables that are differentiated and updated."""
-    factor: float
-    """Factor on all learning rates."""
+
+    @property
+    def factor(self) -> float:
+        """Return the factor on all learning rates."""
+        return 1.0 if self.stage is None else self.stage.learning_rate_factor
 
 
 def part_at(problem: Problem, iteration: int) -> Part:
     """Return the part that an iteration belongs to."""
     stages = problem.config.stages
     if stages is None:
-        return Part(0, problem, frozenset(v.key for v in problem.variables), 1.0)
+        return Part(0, None, problem, frozenset(v.key for v in problem.variables))
     number = place(stages, iteration)
     return _part(problem, number, stages[number])
 
@@ -59,7 +63,7 @@ def _part(problem: Problem, number: int, stage: Stage) -> Part:
     views = tuple(replace(v, is_test=v.is_test or (seen is not None and v.name not in seen)) for v in problem.views)
     moving = frozenset(_moving(problem, stage))
     config = problem.config.model_copy(update=given)
-    return Part(number, replace(problem, views=views, config=config), moving, stage.learning_rate_factor)
+    return Part(number, stage, replace(problem, views=views, config=config), moving)
 
 
 def _views(problem: Problem, stage: Stage) -> set[str] | None:
@@ -117,11 +121,10 @@ def require_single_pixels(problem: Problem) -> None:
     for part in parts_of(problem):
         if part.problem.config.pixel_batch_size is None:
             continue
-        stage = config.stages[part.number] if config.stages else None
         for integrator, plugin in ((problem.integrator, config.integrator), (problem.baseline, config.baseline)):
             if integrator is not None and plugin is not None:
-                if stage is not None and stage.max_depth is not None:
-                    integrator = _integrator(plugin, stage.max_depth)
+                if part.stage is not None and part.stage.max_depth is not None:
+                    integrator = _integrator(plugin, part.stage.max_depth)
                 _require_single_pixels(part, integrator)
 
 
