@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import re
-import sys
 from collections.abc import Callable
 from types import FrameType
 from typing import Any
@@ -13,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from places import ROOT
+from profiled import calls_noted
 
 SRC = ROOT / "src/pathreplay"
 SECTION = re.search(
@@ -32,15 +32,12 @@ def called(action: Callable[[], Any]) -> list[tuple[str, str]]:
     """Functions of the package by module and name, in the order of their first call."""
     calls: dict[tuple[str, str], None] = {}
 
-    def note(frame: FrameType, event: str, _: Any) -> None:
-        if event == "call" and frame.f_code.co_filename.startswith(f"{SRC}/"):
+    def note(frame: FrameType) -> None:
+        if frame.f_code.co_filename.startswith(f"{SRC}/"):
             calls.setdefault((frame.f_code.co_filename.removeprefix(f"{SRC}/"), frame.f_code.co_name))
 
-    sys.setprofile(note)
-    try:
+    with calls_noted(note):
         action()
-    finally:
-        sys.setprofile(None)
     return list(calls)
 
 

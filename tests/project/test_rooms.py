@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import ast
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +18,7 @@ import pytest
 import pathreplay
 from driven import FLOOR, KEYS, attached, backward, foggy, weights, world
 from pathreplay.scenes.parameters import get_array
+from profiled import calls_noted
 
 SOURCE = Path(pathreplay.__file__).parent
 #: The files at the top, but for `cli.py`, `torch.py` and `jax.py`.
@@ -246,18 +245,14 @@ def followed() -> Iterator[set[tuple[str, str]]]:
     """All calls from room to other room within the block."""
     calls: set[tuple[str, str]] = set()
 
-    def look(frame: FrameType, event: str, _: Any) -> None:
-        if event == "call" and Path(frame.f_code.co_filename) in TREES:
+    def note(frame: FrameType) -> None:
+        if Path(frame.f_code.co_filename) in TREES:
             one, other = room_of_call(frame.f_back), room_of_call(frame)
             if one is not None and other is not None and one != other:
                 calls.add((one, other))
 
-    before = sys.getprofile()
-    sys.setprofile(look)
-    try:
+    with calls_noted(note):
         yield calls
-    finally:
-        sys.setprofile(before)
 
 
 def through_surfaces(integrator: mi.Integrator) -> np.ndarray:

@@ -15,7 +15,8 @@ import drjit.opt  # noqa: F401  # makes it an attribute of drjit
 import mitsuba as mi
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from places import ROOT
+
 STUBS = ROOT / "stubs"
 #: Lines of src/ with `Any`, imports included: values of which nobody knows more, and packages that mypy does not read.
 MOST = 80
