@@ -282,8 +282,8 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 _HAS_BENCHMARKS = (_CHECKOUT / "benchmarks" / "__main__.py").is_file()
 
 
-# The options are those of `python -m benchmarks`, which prints its own help. It runs in the current folder, where paths
-# of the command line start. The wheel contains no benchmarks, so its help omits the command.
+# The options are those of `python -m benchmarks`, which prints its own help. It runs in the current folder, so that
+# relative paths resolve as usual. The wheel contains no benchmarks; there `pathreplay --help` omits the command.
 @app.command(
     short_help="Measure time, memory, noise and correctness.",
     hidden=not _HAS_BENCHMARKS,

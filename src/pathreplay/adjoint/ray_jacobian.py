@@ -52,7 +52,7 @@ class Recovery:
 
 @dataclass
 class RayFrame:
-    """Two axes perpendicular to a ray: its coordinates are (s·o/ℓ, t·o/ℓ, s·d, t·d), relative to the ray itself."""
+    """Two axes s, t perpendicular to a ray. Rays near it have coordinates (s·o/ℓ, t·o/ℓ, s·d, t·d) relative to it."""
 
     s: mi.Vector3f
     t: mi.Vector3f

@@ -60,7 +60,7 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
 
 
 def radiance_of(worths: list[Worth]) -> mi.Float:
-    """Estimate the mean radiance seen by arcs: scattered emitter light over the scattering weights of the arcs."""
+    """Estimate the mean radiance seen by arcs: the ratio of scattered emitter light to their scattering weights."""
     from_emitters, total = (dr.sum(worth.light) for worth in worths)
     return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
 

@@ -174,10 +174,11 @@ class Step:
         return late[1]
 
     def along(self, actor: Actor, size: int, actors: int) -> list[int]:
-        """Add short shards of the actor's own to the request that `next` has started; returns their indices.
+        """Add short shards from the actor's own queue to the request that `next` has started; returns their indices.
 
-        They are a fraction of the actor's remaining work, and at most an even share among ``actors``. So requests
-        become shorter towards the end, and all actors still end at about the same time. A gradient has ``size`` bytes.
+        Their time is limited to a fraction of the actor's remaining work, and to an even share among ``actors``. So
+        requests become shorter towards the end, and all actors end at about the same time. The bytes of a gradient,
+        ``size``, limit their number.
         """
         waiting, request = self.waiting.get(actor, []), self.running[actor]
         if not self.scheduler.holds(actor, self.kinds[request.shards[0]]):
@@ -203,7 +204,7 @@ class Step:
             del self.running[actor]
 
     def finished(self, index: int, actor: Actor, seconds: float) -> bool:
-        """Record a result; returns whether it is its shard's first. The actor may run its next request already."""
+        """Record a result; returns whether it is the first of the shard. The actor may run its next request already."""
         self.heard(index, actor)
         self.scheduler.measured(actor, self.kinds[index], seconds)
         first = index not in self.done

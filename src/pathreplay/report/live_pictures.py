@@ -1,4 +1,4 @@
-"""Images of some views during a run, rendered from time to time within a fraction of its time."""
+"""Preview images of some views, rendered at intervals during a run for a limited fraction of the run time."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class CounterSampler:
 
     @staticmethod
     def stream(key: mi.UInt32, stream: Stream) -> CounterSampler:
-        """Create a sampler at the first index of a stream in a key."""
+        """Create a sampler for a key that starts at the first index of a stream."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(int(stream)))
 
     @staticmethod

@@ -102,7 +102,7 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
     half, thick, distance = [2.8, 2.0, 1.0], 0.6, 2.9
     angle = np.radians(55)
     side = [float(distance * np.sin(angle)), 0.0, float(distance * np.cos(angle))]
-    # The normal map covers -0.8 to 0.8 in x and y. Its flat border continues around it, which is also visible.
+    # The normal map covers -0.8 to 0.8 in x and y. Beyond, where its flat border continues, the pane is visible, too.
     middle = T().translate([0.5, 0.5, 0]).scale([half[0] / 0.8, half[1] / 0.8, 1]).translate([-0.5, -0.5, 0])
     normals = _picture(_bumps(texture), wrap_mode="clamp", to_uv=middle)
     glass = {"type": "ref", "id": "glass"}

@@ -56,8 +56,8 @@ def choose_line(
     """Choose the line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
 
     By default the largest change of an entry is a hundredth of the parameter's size. If this would make a non-negative
-    parameter negative (a black texel), the differences are one-sided: a negative reflectance of a linear texture is
-    harmless, but a negative roughness or density is invalid. Transforms are translated randomly. Infinitely ``far``
+    parameter negative (a black texel), the differences are one-sided, because a negative roughness or density is
+    invalid. Transforms are translated randomly. Infinitely ``far``
     emitters (sun, sky), which translation does not change, are rotated about a random axis. Coefficients of ``spectra``
     move such that the decoded values change by such steps: see :mod:`pathreplay.scenes.spectra`.
 

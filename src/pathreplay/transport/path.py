@@ -24,8 +24,8 @@ class PathState:
 
     at: Arrival
     β: mi.Spectrum  # throughput
-    # Throughput with one zero weight per channel left out, see `sustain`: keeps a path alive that still has
-    # derivatives. None if zero weights end the path.
+    # Throughput in which the first zero weight of each channel is replaced, see `sustain`: keeps a path alive that
+    # still has derivatives. None if zero weights end the path.
     β_alive: mi.Spectrum | None
     η: mi.Float  # relative index of refraction since the camera
     depth: mi.UInt32  # number of vertices before this one
@@ -91,12 +91,12 @@ def survival(
 
 
 def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spectrum:
-    """Return the throughput that keeps a differentiated path alive: one zero weight per channel is left out.
+    """Return the throughput that keeps a differentiated path alive: the first zero weight per channel is replaced.
 
     A weight of zero still has a derivative, which multiplies the radiance beyond it. The path therefore continues as if
     that weight were the largest among the channels (or one if all are zero). A second zero makes all derivatives zero
-    and ends the path. So does a null collision with zero probability in a channel: its weight is a choice of the
-    sampling, not of the scene.
+    and ends the path. A null collision with zero probability in a channel ends the path there, too, because its weight
+    is determined by the sampling, not by the scene.
     """
     w = dr.detach(step.w)
     w_max = dr.max(w)

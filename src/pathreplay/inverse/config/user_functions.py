@@ -144,7 +144,7 @@ def _no_numbers(value: object, depth: int = 0) -> str:
     """Describe a value that Dr.Jit cannot convert to an array; return "" if it can.
 
     The check is needed because Dr.Jit's constructors iterate over any sequence. The elements of a string are strings
-    again, so they would recurse forever, uninterruptible by signals.
+    again, so a constructor would recurse forever, uninterruptible by signals.
     """
     if isinstance(value, (list, tuple)):
         if depth == DEEPEST:

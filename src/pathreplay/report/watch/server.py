@@ -161,7 +161,7 @@ class Handler(BaseHTTPRequestHandler):
         return False
 
     def _place(self) -> str | None:
-        """Requested path behind the token; None if the request was refused."""
+        """Return the requested path after the token. If the request is refused, answer it and return None."""
         if not self.server.knows(self.headers.get("Host", "")):
             self._answer(403, "text/plain", b"unknown host name\n")
             return None

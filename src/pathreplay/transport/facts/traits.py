@@ -220,7 +220,7 @@ def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Mesh]:
 
 
 def _ball(mesh: mi.Mesh) -> np.ndarray:
-    """Return a bounding sphere around the box centre; radius 0 for Mitsuba's rectangle, which hides its mesh."""
+    """Return a bounding sphere around the box centre; radius 0 for a rectangle, whose vertices Mitsuba hides."""
     params = mi.traverse(mesh)
     if "vertex_positions" not in params:
         return np.zeros(4)

@@ -87,7 +87,10 @@ def wants_branch(media: Sequence[mi.Medium]) -> bool:
 
 
 def _misses(medium: mi.Medium) -> bool:
-    """Return whether extinction has gradients and varies in space or is zero (unknown while `dr.freeze` records)."""
+    """Return whether extinction has gradients, and is not known to be constant and nonzero.
+
+    Its values are unknown while `dr.freeze` records.
+    """
     moving = with_gradients(medium, "sigma_t", "scale")
     known = medium.is_homogeneous() and not dr.flag(dr.JitFlag.FreezingScope)
     return bool(moving) and not (known and all(dr.all(dr.detach(value) != 0, axis=None) for value in moving))
