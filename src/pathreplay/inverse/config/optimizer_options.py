@@ -30,7 +30,7 @@ class Optimizer(Table):
     amsgrad: Switch | None = None
     """Use the maximum of all second moments so far (AMSGrad)."""
     weight_decay: Positive | None = None
-    """Decoupled weight decay, in the space of the steps (AdamW)."""
+    """Decoupled weight decay of the variable in which the optimiser takes its steps (AdamW)."""
     momentum: Share | None = None
     """Momentum (SGD)."""
     nesterov: Switch | None = None
@@ -40,7 +40,7 @@ class Optimizer(Table):
     history_size: Count | None = None
     """Number of corrections that L-BFGS-B keeps."""
     tolerance: Positive | None = None
-    """L-BFGS-B stops when a step lowers the loss by less than this fraction of the initial loss."""
+    """Fraction of the initial loss; L-BFGS-B stops when a step lowers the loss by less than that."""
 
     @model_validator(mode="after")
     def _of_its_type(self) -> Optimizer:

@@ -90,20 +90,20 @@ class Parameter(Table):
     resolutions: Annotated[list[Count], Field(min_length=1)] | None = None
     """Resolutions of a texture or volume, coarse to fine, as the number of entries along its longest axis."""
     refine_at: list[Count] | None = None
-    """Iterations at which the second and each later resolution begin; default: the stages, if there is one per
-    resolution."""
+    """Iterations at which the second and each later resolution begin; default: the first iterations of the stages, if
+    there are as many stages as resolutions."""
     pose: PoseKind | None = None
     """Optimise a rigid motion of the parameter, which is a to_world transform or the vertex_positions of a mesh."""
     pivot: Vector | None = None
     """Centre of rotation of a pose; default: the origin of the object (for a mesh, the mean of its vertices)."""
     error_scale: Positive | None = None
-    """Length relative to which position errors of a pose are reported."""
+    """Reference length; the report also gives the position error of a pose as a fraction of this length."""
     rotation_learning_rate: Positive | None = None
-    """Learning rate of the rotation in degrees; default: the learning rate of the parameter, in radians."""
+    """Learning rate of the rotation in degrees; default: learning_rate, taken in radians."""
     large_steps_lambda: Positive | None = None
     """Smoothness λ of Large Steps (Nicolet et al. 2021), for vertex_positions."""
     parameterization: TransformKind | None = None
-    """Function of the value in which the optimiser takes its steps."""
+    """Function that maps the value to the variable in which the optimiser takes its steps."""
     total_variation: Positive | None = None
     """Weight of the total variation of a texture or volume."""
     l2_to_initial: Positive | None = None
@@ -113,7 +113,7 @@ class Parameter(Table):
     regularizer: ImportPath | None = None
     """Function of the values that is added to the loss, as module:function."""
     shape: Annotated[list[Count], Field(min_length=1, max_length=8)] | None = None
-    """Shape of an array that is not part of the scene; scene parameters are derived from it."""
+    """Shape of a parameter that is not part of the scene, and from which scene parameters are derived."""
 
     @property
     def displacement(self) -> Displacement:

@@ -10,8 +10,8 @@ from pathreplay.types import Json
 
 HEAD = """# Keys of a job
 
-All keys of a config file. This page is the output of `pathreplay schema --markdown`;
-[jobs](optimize.md) explains how the keys work together.
+This page lists all keys of a job file. It is the output of `pathreplay schema --markdown`.
+[Jobs](optimize.md) explains how the keys work together.
 """
 _TITLES = {
     "Parameter": "[[parameters]]",

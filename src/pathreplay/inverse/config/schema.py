@@ -51,7 +51,7 @@ class Config(Table):
     integrator: Plugin = Plugin(type="pathreplay")
     """Integrator that renders and differentiates; default: pathreplay with the options of the scene's integrator."""
     baseline: Plugin | None = None
-    """Integrator that solves the same problem in the same time, for comparison."""
+    """Integrator of a second run, which solves the same problem in the same time for comparison."""
     parameters: Annotated[list[Parameter], Field(min_length=1)]
     """Parameters to recover."""
     derived: list[Derivation] = Field(default_factory=list)
@@ -75,17 +75,17 @@ class Config(Table):
     measure_snr: Switch = False
     """Compute each gradient from two halves of the samples to estimate its signal-to-noise ratio."""
     max_consecutive_nonfinite: Count = 10
-    """End the run after so many consecutive iterations in which half of a gradient or more is NaN or infinite."""
+    """Number of consecutive iterations with half of a gradient or more NaN or infinite after which the run ends."""
     view_batch_size: Count | None = None
-    """Views per iteration, shuffled by the seed; default: all."""
+    """Number of views per iteration, drawn without repetition; the seed determines the order. Default: all."""
     pixel_batch_size: Count | None = None
-    """Pixels of each view per iteration, drawn by the seed; default: all."""
+    """Number of random pixels per view and iteration; default: all."""
     eval_spp: Count = 128
     """Samples per pixel of the images that are rendered at the start and the end."""
     seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
     """Seed of all random numbers."""
     learning_rate: Positive = 0.02
-    """Learning rate of parameters that have none of their own; with Adam, approximately the length of a step."""
+    """Learning rate of parameters without one of their own; with Adam, approximately the length of a step."""
     final_learning_rate_ratio: Annotated[Positive, Field(le=1)] = 0.1
     """Ratio of the final to the initial learning rate, for schedules other than constant."""
     learning_rate_schedule: Schedule = "constant"
@@ -109,7 +109,7 @@ class Config(Table):
     spp_shards: Count = 1
     """Number of shards into which the samples of each view are split; useful with fewer views than actors."""
     ray: RayOptions = RayOptions()
-    """Ray cluster and its actors."""
+    """Options of the Ray cluster and its actors."""
     output: str | None = None
     """Run folder; default: runs/NAME, with the name of the job file."""
 

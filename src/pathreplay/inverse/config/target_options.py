@@ -20,8 +20,8 @@ class Target(Table):
     masks: list[str] | str | None = None
     """Mask files, one per sensor, whose values weight the pixels: black pixels are ignored."""
     alpha: Literal["black", "mask", "scene", "compare"] = "black"
-    """Treatment of the alpha channel of images: 'black' composites them over black, 'mask' uses alpha as pixel weights,
-    'scene' composites them over the scene's environment, and 'compare' compares alpha as a channel."""
+    """Treatment of the alpha channel of images. 'black' composites them over black, 'scene' over the environment of the
+    scene. 'mask' uses alpha as pixel weights. 'compare' compares alpha as a further channel."""
     scene: str | None = None
     """Scene from which targets are rendered; default: the scene of the job."""
     scene_parameters: dict[str, Argument] | None = None
@@ -29,8 +29,8 @@ class Target(Table):
     values: dict[str, Value] = Field(default_factory=dict)
     """Values of parameters of the target scene, in place of the values in its file."""
     integrator: Plugin | None = None
-    """Integrator that renders the targets; default: path, or volpath for scenes with media, with max_depth, rr_depth
-    and hide_emitters of the job's integrator."""
+    """Integrator that renders the targets. Default: path (volpath in scenes with media), with max_depth, rr_depth and
+    hide_emitters of the job's integrator."""
     spp: Count = 512
     """Samples per pixel of the targets."""
 
@@ -72,7 +72,7 @@ class Capture(Table):
     width: Count | None = None
     """Width of rendered images in pixels; default: the width of the images of the capture."""
     test_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None
-    """Use the first view and every n-th view after it as test views."""
+    """Number n: the first view and every n-th view after it are test views."""
 
     @property
     def source(self) -> str:
