@@ -186,16 +186,16 @@ SCENES = {
         lambda: scene(lamp=lamp(T().translate([0.1, 0.05, 0]).scale([0.4, 0.3, 1]), rgb(1, 1, 1))),
         "lamp.to_world",
         moving(1, 0, 0),
-        "its sides are drawn with another density than is said",
+        "the sampling density of its sides differs from the reported one",
     ),
     "cube with split vertices turns": Scene(
         lambda: scene(wall=backdrop(), box=box(diffuse(rgb(0, 0, 0)))),
         "box.vertex_positions",
         turning(0, 1, 0),
-        "each copy of an edge counts",
+        "every copy of an edge is counted",
     ),
     "lit cube turns": Scene(
-        grey_box, "box.vertex_positions", turning(0, 1, 0), "creases are missing, hidden faces shade outlines"
+        grey_box, "box.vertex_positions", turning(0, 1, 0), "creases are missing, and hidden faces shade outlines"
     ),
     "occluder of a shadow": Scene(shadow, "occluder.to_world", ASIDE, step=0.03),
     "emitter of a shadow": Scene(shadow, "lamp.to_world", ASIDE, step=0.03),
@@ -206,7 +206,7 @@ SCENES = {
         "motion of the receiver is missing",
         step=0.03,
     ),
-    "shadow under a sky": Scene(under_sky, "occluder.to_world", ASIDE, "as for the glowing rectangle", step=0.01),
+    "shadow under a sky": Scene(under_sky, "occluder.to_world", ASIDE, "same cause as glowing rectangle", step=0.01),
     "emitter, seen from its back, lights a wall": Scene(
         lambda: lamp_from_behind(T().translate([0.9, 0.8, 0.6]).rotate([0, 1, 0], 160).scale([0.4, 0.3, 1]), 30, 10, 5),
         "lamp.to_world",
@@ -221,7 +221,7 @@ SCENES = {
         "the rims of turned rectangles are not sampled",
     ),
     "occluder, seen in a rough mirror": Scene(rough_mirror, "occluder.to_world", moving(1, 0.3, 0.4), "", 3, 0.03),
-    "camera": Scene(dark_sheet, "camera.to_world", ASIDE, "cameras that move are not supported"),
+    "camera": Scene(dark_sheet, "camera.to_world", ASIDE, "moving cameras are not supported"),
 }
 
 

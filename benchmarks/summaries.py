@@ -28,7 +28,7 @@ def _attached(record: Record) -> str:
         for key, versus in _pairs(record, "sweep", "prb")
         if key.scene == attached.SCENE
     ]
-    return markdown(["gradient of what moves, sweep / prb", "depth", "time"], rows)
+    return markdown(["moving parameter, sweep / prb", "depth", "time"], rows)
 
 
 def _iteration(record: Record) -> str:
@@ -39,7 +39,8 @@ def _iteration(record: Record) -> str:
         for sampling, method in (("scene", own), ("sobol", sobol))
         for key, versus in _pairs(record, method, theirs)
     ]
-    return markdown(["optimisation step, relative to Mitsuba's", "`sampling`", "time", "time at equal variance"], rows)
+    header = ["optimisation step, relative to Mitsuba's loop", "`sampling`", "time", "time at equal variance"]
+    return markdown(header, rows)
 
 
 def _media(record: Record) -> str:
@@ -88,7 +89,7 @@ def _wrong(record: Record) -> str:
         baseline = points.get(media.RIVAL)
         if baseline is not None and baseline.verdict == "fail":
             rows.append([scene, *(truth.told(points.get(name)) for name in (truth.STEPS[1], "score", media.RIVAL))])
-    return markdown(["gradient by", "finite differences of `volpath`", "`pathreplay`", "`prbvolpath`"], rows)
+    return markdown(["parameter", "finite differences of `volpath`", "`pathreplay`", "`prbvolpath`"], rows)
 
 
 def _pairs(record: Record, ours: str, theirs: str) -> Iterator[tuple[Turns, Versus]]:

@@ -132,7 +132,8 @@ def worth(record: Record) -> str:
         rows.append([scene, str(ratio), f"{typical:.2f}", f"{share:.0%}"])
     if not rows:
         return "*Not measured yet.*"
-    header = ["one number", "variance / central difference", "median of squared errors / the same", "largest share"]
+    ratios = [f"{quantity} / central difference" for quantity in ("variance", "median squared error")]
+    header = ["parameter", *ratios, "fraction of variance in one pass"]
     return markdown(header, rows)
 
 

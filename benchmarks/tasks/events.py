@@ -47,7 +47,7 @@ def table(record: Record) -> str:
     events = {point.max_depth: point.mean for point in record.points if point.scene == COUNTED and point.mean}
     methods = list(dict.fromkeys(point.method for point in record.points if point.scene != COUNTED))
     cells = {(point.max_depth, point.method): point for point in record.points}
-    header = ["depth", "events a path", *(f"{m}, s" for m in methods), *(f"{m}, MiB" for m in methods)]
+    header = ["depth", "events per path", *(f"{m}, s" for m in methods), *(f"{m}, MiB" for m in methods)]
     rows = []
     for depth, count in events.items():
         row = [cells.get((depth, method)) for method in methods]

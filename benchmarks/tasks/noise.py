@@ -66,7 +66,7 @@ def table(record: Record) -> str:
             if any(points):
                 cells = [kind, *map(_error, points), _error(sweep), _slowness(points, sweep)]
                 rows.append([scene, str(depth - 1), *cells])
-    header = ["scene", "bounces", "noise is put", *(f"{level:g}" for level in levels), "Monte Carlo", "time / sweep"]
+    header = ["scene", "bounces", "noise added to", *(f"{level:g}" for level in levels), "Monte Carlo", "time / sweep"]
     return markdown(header, rows)
 
 

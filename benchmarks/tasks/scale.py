@@ -80,7 +80,7 @@ def table(record: Record) -> str:
     sums = [p for p in record.points if p.measure == "sum"]
     shapes = [p for p in record.points if p.measure == "gradient"]
     steps = [p for p in record.points if p.measure == "step"]
-    traced, recorded = "shapes and BSDFs: a gradient that is traced", "shapes and BSDFs: a step of a job"
+    traced, recorded = "shapes and BSDFs: traced gradient", "shapes and BSDFs: step of a job"
     tables = _runs(runs), _sums(sums), _shapes(traced, "prb", shapes), _shapes(recorded, f"prb, {USUAL}", steps)
     tables += (_actors([p for p in record.points if p.measure == "iterations"]),)
     return "\n\n".join(part for part in tables if part)
@@ -112,12 +112,12 @@ def _runs(points: list[Point]) -> str:
         )
     head = [
         "job",
-        "million pixels of all views",
+        "million pixels in all views",
         "seconds",
-        "peak MiB: first step, later ones, end",
-        "without pages of files",
-        "bytes a pixel",
-        "x (values + Adam's state)",
+        "peak MiB: first, second, third step, end",
+        "without cached file pages",
+        "bytes per pixel",
+        "multiple of values and Adam state",
     ]
     return markdown(head, rows)
 
@@ -155,5 +155,5 @@ def _actors(points: list[Point]) -> str:
         seconds = st.median(point.values)
         share = f"{seconds / one[point.scene]:.2f}" if point.scene in one else ""
         rows.append([point.scene, point.method, f"{seconds:.3f}", share])
-    head = ["an iteration of a job, one thread each", "computed by", "seconds (median)", "of one actor's"]
+    head = ["iteration of a job, one thread each", "computed by", "seconds (median)", "relative to one actor"]
     return markdown(head, rows) if rows else ""

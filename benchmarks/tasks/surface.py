@@ -52,5 +52,5 @@ def table(record: Record) -> str:
         for point in methods.values()
     ]
     return markdown(
-        ["scene", "by", "method", "seconds (median)", "time / prb", "variance / prb", "time x variance"], rows
+        ["scene", "parameter", "method", "seconds (median)", "time / prb", "variance / prb", "time x variance"], rows
     )
