@@ -19,14 +19,15 @@ from pathreplay.scenes.descriptions import one_line
 if TYPE_CHECKING:
     import torch
 
-# An image with less than this fraction of the target's mean square counts as black: its scale factor tends to 0.
+# Fraction of the target's mean square. The scale factor tends to 0 for images whose mean square is smaller.
 _BLACK = 1e-9
 
 
 def scale_invariant(image: mi.TensorXf, target: mi.TensorXf, weight: mi.TensorXf | None = None) -> mi.TensorXf:
     """Compute (s I - T)² with the least-squares scale s = Σ w I T / Σ w I² of the whole image.
 
-    The scale s is detached: at the minimum, the derivative of the loss by s is zero. For a black image, s is 0.
+    The scale s is detached, because it minimises the loss: the derivative of the loss with respect to s is zero. For a
+    black image, s is 0.
 
     Args:
         image: rendered image I, shape (height, width, channels).
