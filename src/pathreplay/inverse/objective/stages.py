@@ -31,7 +31,7 @@ class Part:
     number: int
     stage: Stage | None
     problem: Problem
-    """With the options of the stage, and the views that it trains on; their images are whole (see `scaled`)."""
+    """The problem with the options and training views of the stage. Its images are not downscaled (see `scaled`)."""
     moving: frozenset[str]
     """Variables that are differentiated and updated."""
 
@@ -67,7 +67,10 @@ def _part(problem: Problem, number: int, stage: Stage) -> Part:
 
 
 def _views(problem: Problem, stage: Stage) -> set[str] | None:
-    """Return the names of the views of a stage; None: all. Raises PathreplayError for an unknown or test view."""
+    """Return the names of the training views of a stage, or None if it uses all of them.
+
+    Raises PathreplayError if the stage names an unknown view or a test view.
+    """
     if stage.sensors is None:
         return None
     ids = {view.name: problem.scene.sensors()[view.sensor].id() for view in problem.views}
@@ -162,7 +165,7 @@ def _integrator(plugin: Plugin, max_depth: int) -> mi.Integrator:
 
 
 def scaled(view: View, downscale: int) -> View:
-    """Downscale target and weight of a view by box averages; masked pixels do not contribute."""
+    """Downscale target and weight of a view by averaging squares of pixels. Masked pixels do not contribute."""
     if downscale == 1:
         return view
     if view.weight is None:
@@ -180,7 +183,10 @@ def _means(image: Image, n: int) -> Image:
 
 
 class Staged:
-    """An `Evaluate` that applies the stage of each shard; keeps the evaluator of one stage at a time."""
+    """Function `Evaluate` that applies the options of each shard's stage.
+
+    Only the evaluator of the current stage is kept in memory.
+    """
 
     def __init__(self, problem: Problem, integrator: mi.Integrator, plugin: Plugin, record: bool = True) -> None:
         self.problem, self.integrator, self.plugin, self.record = problem, integrator, plugin, record
@@ -190,7 +196,7 @@ class Staged:
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`."""
         if self._number != shard.stage or self._evaluate is None:
-            self._evaluate, self._number = None, shard.stage  # free the old one first
+            self._evaluate, self._number = None, shard.stage  # free the previous evaluator first
             self._evaluate = self._evaluator(shard.stage)
         return self._evaluate(values, shard, learned)
 
@@ -200,7 +206,7 @@ class Staged:
         part = _part(self.problem, number, stage)
         if stage.max_depth is not None:
             integrator = _integrator(self.plugin, stage.max_depth)
-            stateful(integrator).silence(stateful(self.integrator).warned)  # do not repeat its warnings
+            stateful(integrator).silence(stateful(self.integrator).warned)  # do not repeat warnings
         views = tuple(scaled(view, stage.downscale) if not view.is_test else view for view in part.problem.views)
         return Evaluator(replace(part.problem, views=views), integrator, self.record, part.moving)
 
