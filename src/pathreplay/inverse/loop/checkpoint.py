@@ -1,4 +1,4 @@
-"""The state of a run, and its checkpoints: sealed safetensors files from which it resumes exactly."""
+"""The state of a run, and checkpoints, which are safetensors files with a checksum from which a run resumes exactly."""
 
 from __future__ import annotations
 
@@ -38,9 +38,11 @@ class Entry:
     dropped: NonNegativeInt = 0
     """Number of gradient entries of single views that were NaN or infinite and counted as zero."""
     errors: dict[str, float] = field(default_factory=dict)
-    """Root mean square errors after the step of variables with known truth, and errors of poses (`PoseError.of`)."""
+    """Errors after the step: root mean square errors of variables whose true value is known, and `PoseError.of`."""
     picture_error: float | None = None
-    """Root mean square error of the images without their noise, in iterations that measure it (with a baseline)."""
+    """Root mean square error of the images without rendering noise, or None if the iteration does not measure it.
+
+    Only some iterations of a run with a baseline measure it."""
     penalty: FiniteFloat = 0.0
     """Sum of all regularizers."""
     spp: NonNegativeInt = 0
@@ -64,7 +66,7 @@ class Run:
     values: dict[str, Array]
     """Decoded values of the variables, by key."""
     learned: Arrays = field(default_factory=dict)
-    """Statistics that evaluations pass on to later ones (baselines of media), by name."""
+    """Statistics that evaluations pass on to later evaluations, such as the learned baselines of media, by name."""
     history: list[Entry] = field(default_factory=list)
     baseline: Run | None = None
     """A run of another integrator from the same initial values and in the same time."""
@@ -86,7 +88,7 @@ _VALUE, _LEARNED = "value:", "learned:"
 
 
 def save(run: Run) -> Content:
-    """Serialise a run as a sealed file, whose content is generated while it is written."""
+    """Serialise a run as a file with a checksum. The content is generated while the file is written."""
     state = run.optimiser.state()
     plain: dict[str, Array] = {
         **{_LEARNED + name: value for name, value in run.learned.items()},

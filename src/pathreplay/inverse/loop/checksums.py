@@ -18,7 +18,7 @@ from pathreplay.platform.files import file_problem
 from pathreplay.platform.tensor_files import safetensors_chunks
 
 SUMS = "checksums.json"
-"""File with the size and checksum of each initial and target image in a run folder, by name."""
+"""Name of the file that lists the sizes and checksums of the initial and target images in a run folder."""
 
 SEAL = "sha256"
 """Name of the last tensor of a sealed file, which is the checksum of all preceding bytes."""
@@ -61,7 +61,10 @@ def require_seal(path: Path) -> None:
 
 
 def with_sums(files: Mapping[str, Content]) -> dict[str, Content]:
-    """Append the file `SUMS` to files by name; its content is generated after the others have been written."""
+    """Add the file `SUMS` to a dictionary of files, as the last one.
+
+    Its content is generated after all other files have been written, because it lists their checksums.
+    """
     sums: dict[str, _Sum] = {}
 
     def summed(name: str, content: Content) -> Iterator[Chunk]:
