@@ -50,7 +50,7 @@ def read_capture(
     """Read a capture.
 
     Args:
-        capture: its table in the job.
+        capture: table of the capture in the job.
         base: folder that relative paths start from.
         size_of: returns the width and height of an image file.
         pixel_format: pixel format of the films.
@@ -87,7 +87,7 @@ def fingerprint(shots: Iterable[Shot]) -> str:
 
 
 def _mask(photo: Photo, masks: Path) -> Path:
-    """Find the mask of a photo: its file name with '.png' appended, or in place of its suffix."""
+    """Find the mask of a photo, named like the photo with '.png' appended, or with '.png' in place of the suffix."""
     image = photo.image.name
     mask = next((p for n in (f"{image}.png", f"{photo.image.stem}.png") if not file_problem(p := masks / n)), None)
     if mask is None:
@@ -96,7 +96,10 @@ def _mask(photo: Photo, masks: Path) -> Path:
 
 
 def _names(files: list[str]) -> list[str]:
-    """Make unique names that are valid for sensors and files: file names, with folders if these are ambiguous."""
+    """Make unique names of photos that are valid as names of sensors and files.
+
+    The names are made from the file names or, if file names are ambiguous, from the paths.
+    """
     names = [Path(file).stem for file in files]
     if len(set(names)) < len(names):
         names = [str(Path(file).with_suffix("")) for file in files]

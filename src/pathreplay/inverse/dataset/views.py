@@ -39,7 +39,7 @@ def sensors_of(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int
         wanted: ids or indices; None selects all.
 
     Returns:
-        The indices of the sensors by a unique name that is valid as a file name.
+        The index of each sensor, by a unique name that is valid as a file name.
 
     Raises:
         PathreplayError: a sensor does not exist, or none is selected.
@@ -71,7 +71,7 @@ def _place(item: int | str, ids: list[str], names: list[str]) -> int:
 
 
 def test_views_of(scene: mi.Scene, sensors: dict[str, int], named: Sequence[int | str], shots: list[str]) -> set[str]:
-    """Return the names of the test views: the sensors ``named`` by the job, and those of these ``shots``."""
+    """Return the names of the test views: sensors that the job has ``named``, and sensors of the given ``shots``."""
     available = sensors_of(scene, None)
     ids = [sensor.id() for sensor in scene.sensors()]
     indices = {_place(item, ids, list(available)) for item in named}
