@@ -1,7 +1,7 @@
-"""Captures: images with camera poses, from a `transforms.json` or a COLMAP model, as Mitsuba sensors.
+"""Read captures (images with camera poses) from a `transforms.json` or a COLMAP model, and make Mitsuba sensors.
 
-The cameras of `Photo` look along -z with x to the right and have focal lengths in pixels. Mitsuba's cameras look along
-+z with x to the left and have a field of view.
+The cameras of `Photo` look along -z with x to the right, and are specified by focal lengths in pixels. Mitsuba's
+cameras look along +z with x to the left, and are specified by a field of view.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def read_capture(
         pixel_format: pixel format of the films.
 
     Returns:
-        The shots by name, in the order of the capture.
+        The images with their cameras (`Shot`), by name, in the order of the capture.
 
     Raises:
         PathreplayError: a file cannot be read, a lens model is not supported, or a camera pose is not rigid.

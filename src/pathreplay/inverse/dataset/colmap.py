@@ -29,7 +29,7 @@ MODELS: dict[str, tuple[int, str]] = {
     "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
     "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
 }
-"""Lens models: number in binary files, and names of the parameters."""
+"""Supported lens models: for each name, the number in binary files and the names of the parameters."""
 NUMBERS = {number: name for name, (number, _) in MODELS.items()}
 
 MOST_BYTES = 8 * 2**30

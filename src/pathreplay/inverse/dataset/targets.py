@@ -1,4 +1,4 @@
-"""Target images and pixel weights, rendered from a target scene or read from files, and true parameter values."""
+"""Target images and pixel weights from a target scene or from files, and true parameter values from a target scene."""
 
 from __future__ import annotations
 
@@ -85,7 +85,9 @@ def target_scene(
 
 
 def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> dict[str, Array]:
-    """Return the true values of parameters that the target scene has in a comparable shape (see `comparable`).
+    """Return the true values of parameters, which are their values in the target scene.
+
+    Parameters that the target scene lacks, or has in a shape that is not `comparable`, are left out.
 
     Args:
         scene: the target scene.
@@ -228,9 +230,9 @@ def read_masks(
     resize: bool = False,
     lenses: Mapping[str, Lens] = MappingProxyType({}),
 ) -> dict[str, Image]:
-    """Read mask files as weights of the pixels, by view; black pixels get the weight 0.
+    """Read mask files as weights of the pixels, by view. Black pixels get the weight 0.
 
-    The arguments have the same meaning as those of `read_targets` and `Reading`, and the errors are the same.
+    See `read_targets` and `Reading` for arguments and errors.
     """
     weights: dict[str, Image] = {}
     for name, file in files.items():

@@ -46,7 +46,7 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether images need no resampling: there is no distortion, and pixels are square."""
+        """Whether images need no resampling, because there is no distortion and pixels are square."""
         bends = self.fisheye or any(self.radial) or any(self.tangential)
         return not bends and abs(self.fy / self.fx - 1) * self.h / 2 <= OFF
 

@@ -28,7 +28,7 @@ Array = NDArray[np.float32]
 
 
 class DiskStore:
-    """Keeps up to ``room`` bytes of arrays in memory and the others in a file in TMPDIR (default: /var/tmp)."""
+    """Keeps up to ``room`` bytes of arrays in memory, and other arrays in a file in TMPDIR (default: /var/tmp)."""
 
     def __init__(self, room: int = ROOM) -> None:
         self.room = room

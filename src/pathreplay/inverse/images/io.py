@@ -98,7 +98,7 @@ def _linear(bitmap: mi.Bitmap) -> Image:
 
 
 def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
-    """Open a file; return its bitmap and a function that orients and scales the decoded pixels."""
+    """Return the bitmap of a file, and a function that orients and scales the decoded pixels."""
     with path.open("rb") as file:
         magic = file.read(2)
         if magic in (b"P5", b"P6"):
@@ -261,7 +261,7 @@ def png_bytes(image: Image, exposure: float = 1.0) -> bytes:
 
 
 def encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Encode linear radiance as sRGB, both in [0, 1]."""
+    """Encode linear radiance in [0, 1] as sRGB values in [0, 1]."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
 
 

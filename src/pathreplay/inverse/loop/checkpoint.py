@@ -1,4 +1,4 @@
-"""The state of a run, and checkpoints, which are safetensors files with a checksum from which a run resumes exactly."""
+"""State of a run, and its checkpoints: safetensors files with a checksum, from which a run resumes exactly."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Entry:
     dropped: NonNegativeInt = 0
     """Number of gradient entries of single views that were NaN or infinite and counted as zero."""
     errors: dict[str, float] = field(default_factory=dict)
-    """Errors after the step: root mean square errors of variables whose true value is known, and `PoseError.of`."""
+    """Errors after the step: RMS errors of variables with a known true value, and errors of poses (`PoseError.of`)."""
     picture_error: float | None = None
     """Root mean square error of the images without rendering noise, or None if the iteration does not measure it.
 
@@ -105,7 +105,7 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Col
     Args:
         path: the checkpoint.
         run: a new run of the same job, which is changed in place.
-        levels: refinement schedules of the variables, by key; None for variables without one.
+        levels: refinement schedules of the variables, by key; None for variables that are not refined.
         held: keys of variables that are frozen in some stages.
 
     Raises:
@@ -127,7 +127,7 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Col
 def _read(
     path: Path, values: Arrays, levels: Mapping[str, Levels | None], held: Collection[str]
 ) -> tuple[dict[str, Array], State, list[Entry], Arrays]:
-    """Read values, optimiser state, history and learned statistics; `restore` translates the errors it raises."""
+    """Read values, optimiser state, history and learned statistics. `restore` translates the errors of the function."""
     if not path.is_file():
         raise ValueError("no such file")
     with safetensors.safe_open(str(path), framework="numpy") as file:

@@ -97,13 +97,13 @@ def note_of(event: Told) -> str:
 
 
 class Notes:
-    """Log lines of events; recurring events are reported once per parameter."""
+    """Log lines of events. Recurring events are reported once per parameter."""
 
     def __init__(self) -> None:
         self._told: set[tuple[type, str]] = set()
 
     def of(self, event: Event) -> str:
-        """Return the line of an event; "" if it has none, or was reported before."""
+        """Return the log line of an event, or "" if the event has no line or was reported before."""
         if isinstance(event, (Started, Stepped, Stopped)):
             return ""
         if isinstance(event, (NonFinite, LowSNR)):

@@ -57,7 +57,7 @@ from pathreplay.scenes.parameters import get_array, to_value
 # the time of the job.
 JUDGEMENTS = 10
 
-# Fraction of non-finite gradient entries above which an iteration counts towards `max_consecutive_nonfinite`.
+# Smallest fraction of non-finite gradient entries for which an iteration counts towards `max_consecutive_nonfinite`.
 HALF = 0.5
 
 
@@ -158,7 +158,10 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
 
 
 def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
-    """Yield the events of `iterate`, which runs in the context `Problem.computing`; the caller's code does not."""
+    """Yield the events of `iterate`, whose steps run in the context `Problem.computing`.
+
+    The context does not apply to the code that receives the events.
+    """
     events = iterate(problem, run, stop)
     while True:
         with problem.computing():
@@ -324,7 +327,7 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
     stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates, loss)
     stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
-        if not np.isfinite(value.sum(dtype=np.float64)):  # finite if and only if all entries are
+        if not np.isfinite(value.sum(dtype=np.float64)):  # if and only if all entries are finite
             raise PathreplayError(
                 f"'{key}' is not finite after iteration {len(run.history)}; lower its learning rate, or bound it"
             )
@@ -355,7 +358,7 @@ def _plain(problem: Problem, view: View, spp: int) -> Image:
 def ended(problem: Problem, run: Run) -> Run:
     """Return the run with its resulting values, including the exposures of test views.
 
-    The values of the run's baseline are completed in place.
+    The run's baseline is changed in place, in the same way.
     """
     run = replace(run, values=best_values(problem, run))
     for each in filter(None, (run, run.baseline)):

@@ -1,4 +1,4 @@
-"""Signal-to-noise ratio of gradients, and the adaptation of samples per pixel to it.
+"""Signal-to-noise ratio of gradients, and the adaptation of samples per pixel to this ratio.
 
 Let a and b be gradients from two independent halves of the samples. The optimiser uses the mean G = (a + b)/2. The norm
 of the noise of G is estimated by n = |a - b|/2, because E[n²] = E|G - E G|². The squared signal follows from

@@ -27,7 +27,7 @@ from pathreplay.inverse.problem.problem import Problem
 FEW = 4
 """Maximum number of entries of a variable that are perturbed one by one. Larger variables are scaled as a whole."""
 MOST_COLUMNS, MOST_PIXELS, MOST_ROWS = 16, 2**23, 2**20
-"""Maximum number of columns of J, of pixels of all views, and of rows of J, which are subsampled evenly."""
+"""Maximum number of columns of J, of pixels of all views, and of rows of J. More rows are subsampled evenly."""
 MOST_SAMPLES, FREE_SAMPLES, SHARE = 16, 2**22, 0.1
 """Maximum number of samples per pixel, and budget of samples in total. The budget is `FREE_SAMPLES`, or the fraction
 `SHARE` of the run's samples if that is more."""

@@ -77,7 +77,7 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
 
 
 def _begin(problem: Problem, key: str, run: Run) -> int:
-    """Return the first iteration of the current stage or resolution of a variable, whichever is later."""
+    """Return the first iteration of the current stage or resolution of a variable, whichever began later."""
     stages = begins(problem.config.stages or [])[:-1]
     levels = next(v.levels for v in problem.variables if v.key == key)
     return max(at for at in (0, *stages, *(levels.begins if levels else ())) if at <= len(run.history))

@@ -36,7 +36,7 @@ def l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 def l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Compute (I - T)². The gradient is unbiased; the expected value includes the variance of I."""
+    """Compute (I - T)². The gradient is unbiased. The expected value includes the variance of I."""
     return dr.square(image - target)
 
 

@@ -73,7 +73,8 @@ class Evaluation:
 Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]
 """evaluate(values, shard, learned): a pure function, up to rounding in sums over threads.
 
-``values`` are the decoded values of all variables, and ``learned`` is the integrator's state after earlier evaluations.
+``values`` are the decoded values (see `Form`) of all variables. ``learned`` is the state of the integrator after
+earlier evaluations.
 """
 
 

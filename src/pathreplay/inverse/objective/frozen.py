@@ -25,8 +25,8 @@ from pathreplay.inverse.parameters.exposures import derivative
 from pathreplay.samplers.streams import Stream
 from pathreplay.scenes.parameters import keep_only
 
-# Part of every error message of Dr.Jit about a function that cannot be frozen. Plugins that hide arrays from Dr.Jit
-# prevent freezing. In Mitsuba 3.9.1 these are `orthographic` and `thinlens`, but plugins do not report it beforehand.
+# Part of every error message of Dr.Jit about a function that cannot be frozen. The cause are plugins that hide arrays
+# from Dr.Jit, in Mitsuba 3.9.1 `orthographic` and `thinlens`. Other such plugins are only known after an attempt.
 _RECORDING = "while recording a frozen function"
 
 
@@ -108,7 +108,7 @@ class Recordings:
     ) -> ViewResult:
         """See the function `differentiate`.
 
-        Raises NotRecordable if recording fails; a part of the gradient may have been added to the parameters by then.
+        Raises NotRecordable if recording fails. A part of the gradient may have been added to the parameters by then.
         """
         keys = list(params.keys())
         # One function per view, because Dr.Jit warns about functions that are recorded often.

@@ -22,7 +22,7 @@ class Batch:
 
     pixels: mi.UInt32
     share: float
-    """Fraction of the image's pixels that have a nonzero weight; the batch is a random sample of these pixels."""
+    """Fraction of the image's pixels that have a nonzero weight, from which the batch is drawn."""
 
     @staticmethod
     def of(weight: Array | None, size: tuple[int, int], most: int, seed: int) -> Batch | None:

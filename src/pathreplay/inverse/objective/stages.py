@@ -26,7 +26,7 @@ from pathreplay.scenes.descriptions import load_integrator
 
 @dataclass(frozen=True)
 class Part:
-    """The problem in one stage, or in the whole job if it has no stages."""
+    """The problem in one stage of a job, or in the whole job if the job has no stages."""
 
     number: int
     stage: Stage | None
@@ -42,7 +42,7 @@ class Part:
 
 
 def part_at(problem: Problem, iteration: int) -> Part:
-    """Return the part that an iteration belongs to."""
+    """Return the part (stage) that an iteration belongs to."""
     stages = problem.config.stages
     if stages is None:
         return Part(0, None, problem, frozenset(v.key for v in problem.variables))
@@ -51,7 +51,7 @@ def part_at(problem: Problem, iteration: int) -> Part:
 
 
 def parts_of(problem: Problem) -> list[Part]:
-    """Return the part of each stage, or the one part of a job without stages."""
+    """Return the part of each stage, or the single part of a job without stages."""
     stages = problem.config.stages
     return [_part(problem, n, stage) for n, stage in enumerate(stages)] if stages else [part_at(problem, 0)]
 
@@ -119,7 +119,7 @@ def require_stages(problem: Problem) -> None:
 
 
 def require_single_pixels(problem: Problem) -> None:
-    """Raise PathreplayError if pixels are batched in a view that does not support it."""
+    """Raise PathreplayError if pixels are batched in a view that does not support pixel batches."""
     config = problem.config
     for part in parts_of(problem):
         if part.problem.config.pixel_batch_size is None:
@@ -183,7 +183,7 @@ def _means(image: Image, n: int) -> Image:
 
 
 class Staged:
-    """Function `Evaluate` that applies the options of each shard's stage.
+    """Evaluation function (see `Evaluate`) that applies the options of each shard's stage.
 
     Only the evaluator of the current stage is kept in memory.
     """
@@ -216,8 +216,8 @@ def evaluator_of(problem: Problem, integrator: mi.Integrator, plugin: Plugin) ->
 
     Args:
         problem: the problem.
-        integrator: evaluates the problem; joint problems use the integrators of their parts.
-        plugin: description of the integrator, from which stages create others.
+        integrator: integrator that renders and differentiates. Joint problems use the integrators of their parts.
+        plugin: description of the integrator, from which stages with another ``max_depth`` create their integrators.
 
     Returns:
         The evaluator.

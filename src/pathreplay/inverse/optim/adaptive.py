@@ -25,7 +25,7 @@ _MOMENTS = _FIRST, _SECOND, _GREATEST
 PIECE = 2**22
 """Maximum number of entries that are stepped at once, which limits each temporary array of a step to 16 MB.
 
-Larger variables are stepped in pieces, except uniform ones."""
+Larger variables are stepped in pieces. Uniform variables (see `DrJitOptimiser`) are not split."""
 
 
 @dataclass(frozen=True)

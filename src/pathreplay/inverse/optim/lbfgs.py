@@ -132,7 +132,7 @@ class LineSearch:
         return parts
 
     def answer(self) -> dict[str, Array]:
-        """Return the point with the lowest loss so far; empty before the first step."""
+        """Return the point with the lowest loss so far, or an empty dictionary before the first step."""
         return self._split(self._points[int(np.argmin(self._losses))]) if self._losses else {}
 
     def state(self) -> State:

@@ -33,13 +33,13 @@ class Derived:
     of: tuple[str, ...]
     """Keys of the variables that the function takes after p₀."""
     first: SceneValue
-    """The decoded value p₀ in the scene; detached."""
+    """The decoded value p₀ in the scene (see `Form`), detached."""
     form: Form
     """Conversion between the decoded value and the value that Mitsuba stores."""
     truth: Array | None = None
 
     def value(self, variables: Mapping[str, SceneValue]) -> SceneValue:
-        """Compute the decoded value p; derivatives propagate to the variables.
+        """Compute the decoded value p. Derivatives propagate to the variables.
 
         Args:
             variables: Dr.Jit values by key.

@@ -65,12 +65,12 @@ def comparable(shape: Sequence[int], other: Sequence[int]) -> bool:
 
 
 def matched(grid: Array, other: Array) -> Array:
-    """Resample ``grid`` to the shape of ``other``; the two must be `comparable`."""
+    """Resample ``grid`` to the shape of ``other``. The two shapes must be `comparable`."""
     return grid if grid.shape == other.shape else resampled(grid, other.shape)
 
 
 def rmse(value: Array, truth: Array) -> float:
-    """Compute the root mean square error; a grid is resampled to the resolution of the truth."""
+    """Compute the root mean square error of values. A grid is resampled to the resolution of the true values."""
     a, b = matched(value, truth).reshape(-1), truth.reshape(-1)
     # Work in pieces, because temporary arrays in double precision need four times the memory of the values.
     squares = [

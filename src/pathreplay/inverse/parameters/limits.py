@@ -30,7 +30,7 @@ def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> 
     largest = max(axes)
 
     def cells(size: int) -> int:
-        # Python integers, which do not overflow for any input.
+        # This uses Python integers, which never overflow.
         return channels * prod(max(min(n, 2), (n * size + largest // 2) // largest) for n in axes)
 
     wanted = max(resolutions)

@@ -1,4 +1,4 @@
-"""Poses: rigid motions of transforms and meshes as variables, and their errors.
+"""Poses: rigid motions of transforms and meshes as variables, and errors of poses.
 
 With the transform M₀ of the scene, the pivot c, the translation t and the rotation vector r (axis times angle),
 
@@ -40,7 +40,7 @@ class Pose:
     key: str
     kind: PoseKind
     base: SceneValue
-    """M₀ or the vertex positions in the scene; detached."""
+    """M₀ or the vertex positions in the scene, detached."""
     pivot: tuple[float, float, float]
     distance: float | None
     """Length relative to which position errors are reported."""
@@ -57,7 +57,7 @@ class Pose:
         return tuple(self.parts().values())
 
     def value(self, variables: Mapping[str, Any]) -> SceneValue:
-        """Compute the value of the scene parameter; derivatives propagate to the variables.
+        """Compute the value of the scene parameter. Derivatives propagate to the variables.
 
         Args:
             variables: ``mi.Vector3f`` of width 1 by key: translation in scene units, rotation vector in radians.
@@ -122,7 +122,7 @@ def make_pose(key: str, value: SceneValue, kind: PoseKind, pivot: list[float] | 
 
     Args:
         key: key of the parameter.
-        value: its value in the scene.
+        value: value of the parameter in the scene.
         kind: which parts of the motion are variables.
         pivot: centre of rotation; default: the origin of the transform, or the mean of the vertices.
         distance: length relative to which position errors are reported.

@@ -142,7 +142,9 @@ class Own:
 
 
 def total_variation(values: mi.TensorXf) -> mi.TensorXf:
-    """Compute the total variation of a grid: the sum over its axes of mean √(Δv² + r²) - r, with r = `ROUND`.
+    """Compute the total variation Σ mean(√(Δv² + r²) - r) of a grid, where r is `ROUND`.
+
+    The sum is over the spatial axes. The mean is over the differences Δv of all neighbours along an axis.
 
     Args:
         values: a texture (height, width, channels) or a volume (depth, height, width, channels).

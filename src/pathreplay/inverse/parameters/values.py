@@ -93,7 +93,7 @@ def adapted_image(name: str, image: Image, other: str, channels: int) -> Image:
 
 
 def require_finite_array(name: str, array: Array) -> None:
-    """Raise PathreplayError if an entry is NaN or infinite; the message names the first one."""
+    """Raise PathreplayError if an entry is NaN or infinite, and name the first such entry in the message."""
     bad = ~np.isfinite(array)
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])

@@ -264,7 +264,7 @@ def _start(key: str, like: SceneValue, form: Form, entry: Parameter, base: Path,
     elif entry.initial is None:
         start = parameters.get_array(like)
     else:
-        assert not isinstance(entry.initial, Displacement)  # the schema allows that for poses only
+        assert not isinstance(entry.initial, Displacement)  # the schema allows these for poses only
         start = form.of_colours(key, make_value(key, like, entry.initial, base))
     for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
         if bound is not None and wrong(start, np.float32(bound)).any():

@@ -1,4 +1,4 @@
-"""Default integrators: of a job, from the integrator of its scene, and of rendered targets, from that of the job."""
+"""Default integrators of jobs, derived from the scene, and of rendered targets, derived from the job."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.types import Json
 
 SHOWN = {"max_depth": "the length of paths", "hide_emitters": "whether emitters are visible"}
-"""Options that change the expected image, and what each determines."""
+"""Options that change the expected image, with descriptions for messages."""
 
 
 def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None) -> tuple[Config, tuple[str, ...]]:

@@ -134,7 +134,7 @@ class Problem:
         return {n for n, reached in enumerate(flags) if reached}
 
     def scenes(self) -> tuple[Problem, ...]:
-        """Return the problem, or the problems of all scenes of a joint problem."""
+        """Return the problems of all scenes of a joint problem, or this problem alone if it has a single scene."""
         return (self,)
 
     def home(self, view: View) -> tuple[Problem, View]:
@@ -161,7 +161,7 @@ def variables_of(problem: Problem, values: Arrays) -> dict[str, dr.ArrayBase]:
 
 
 def scene_values(problem: Problem, variables: Mapping[str, dr.ArrayBase]) -> dict[str, SceneValue]:
-    """Compute the scene parameters in the form that Mitsuba stores; derivatives propagate to the variables.
+    """Compute the scene parameters in the form that Mitsuba stores. Derivatives propagate to the variables.
 
     Args:
         problem: the problem.
