@@ -332,10 +332,7 @@ def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
 
 
 def read_table(path: Path, changes: Sequence[str] = ()) -> Any:
-    """Read the file of a job as `load_config` does, but without checks.
-
-    Raises PathreplayError if the file cannot be read.
-    """
+    """Read a job as `load_config` does, without checking it. Raises PathreplayError if the file cannot be read."""
     problem = file_problem(path, most_bytes(path))
     if problem == MISSING:
         siblings = path.parent.glob("*") if path.parent.is_dir() else []

@@ -125,10 +125,7 @@ class Modules:
 
 @contextmanager
 def _same_variant(who: str) -> Iterator[None]:
-    """Return a context that restores Mitsuba's variant and raises PathreplayError if the block changes the variant.
-
-    The message begins with ``who``.
-    """
+    """Restore Mitsuba's variant if the block changed it, and raise a PathreplayError that begins with ``who``."""
     before = mi.variant()
     yield
     if (after := mi.variant()) != before:

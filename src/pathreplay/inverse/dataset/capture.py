@@ -96,10 +96,7 @@ def _mask(photo: Photo, masks: Path) -> Path:
 
 
 def _names(files: list[str]) -> list[str]:
-    """Make unique names of photos that are valid as names of sensors and files.
-
-    The names are made from the file names or, if file names are ambiguous, from the paths.
-    """
+    """Make unique names, valid for sensors and files, from the file names or, if these are ambiguous, the paths."""
     names = [Path(file).stem for file in files]
     if len(set(names)) < len(names):
         names = [str(Path(file).with_suffix("")) for file in files]

@@ -142,10 +142,7 @@ def _known(model: str) -> str:
 
 
 def _place(where: str, posed: _Posed) -> np.ndarray:
-    """Return the camera-to-world matrix of an image, for a camera that looks along -z with y up.
-
-    COLMAP's cameras look along +z with y down.
-    """
+    """Return the camera-to-world matrix of an image, with y up and view along -z (COLMAP: y down, view along +z)."""
     q, t = np.array(posed.quaternion), np.array(posed.translation)
     length = float(np.linalg.norm(q)) if np.isfinite(q).all() else math.nan
     if not abs(length - 1) < UNIT or not (np.abs(t) < 1e9).all():

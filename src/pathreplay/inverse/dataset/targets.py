@@ -66,10 +66,7 @@ class Targets:
 def target_scene(
     spec: str, arguments: Mapping[str, Argument], given: Mapping[str, Value], wanted: Sequence[str], base: Path
 ) -> mi.Scene:
-    """Load the target scene and set its ``given`` values.
-
-    8-bit textures that a ``given`` or ``wanted`` key names are loaded as floating-point textures.
-    """
+    """Load the target scene and set its ``given`` values. 8-bit textures with given or wanted keys become floats."""
     scene = load_scene_with_floats(spec, [*given, *wanted], base, **arguments)
     params = traversed(scene)
     parameters.require_finite(params)
@@ -85,9 +82,7 @@ def target_scene(
 
 
 def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> dict[str, Array]:
-    """Return the true values of parameters, which are their values in the target scene.
-
-    Parameters that the target scene lacks, or has in a shape that is not `comparable`, are left out.
+    """Return the true values of those parameters that the target scene has in a `comparable` shape.
 
     Args:
         scene: the target scene.

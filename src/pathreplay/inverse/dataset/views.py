@@ -101,10 +101,7 @@ def shares_of(
 
 
 def named_views(scene: mi.Scene, sensors: dict[str, int], wanted: Sequence[int | str], key: str) -> list[str]:
-    """Return the names of the views whose sensors are listed in ``wanted``, the value of the job's key ``key``.
-
-    Raises PathreplayError if a sensor does not exist, or has no view in the job.
-    """
+    """Return the views of sensors that a key of the job names. Raises PathreplayError if a sensor has no view."""
     available, ids = list(sensors_of(scene, None)), [sensor.id() for sensor in scene.sensors()]
     names = {index: name for name, index in sensors.items()}
     indices = [_place(item, ids, available) for item in wanted]

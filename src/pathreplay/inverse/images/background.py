@@ -48,10 +48,7 @@ def background(scene: mi.Scene, sensor: int) -> Image:
 
 
 def require_known(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Raise PathreplayError if one of the keys is a parameter of the environment emitter.
-
-    Targets are composited over the environment, which would then change during the run.
-    """
+    """Raise PathreplayError if a key belongs to the environment emitter, over which targets are composited."""
     if (environment := scene.environment()) is None:
         return
     parts = {owner[2] for owner in mi.traverse(environment).properties.values()}

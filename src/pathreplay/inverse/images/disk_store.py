@@ -1,7 +1,6 @@
-"""Store for rarely used arrays, such as the images of all views.
+"""Store for rarely used arrays, such as images, which are kept in memory up to a budget and then on disk.
 
-Arrays are kept in memory up to a budget, and further arrays on disk. Arrays on disk are read-only memory maps of one
-unnamed temporary file, which is removed when the process ends.
+Arrays on disk are read-only memory maps of one unnamed temporary file, which is removed when the process ends.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
 
 
 def _pixmap(file: BinaryIO, head: PixmapHead) -> mi.Bitmap:
-    """Read a PGM or PPM file, since Mitsuba's reader supports neither comments nor big-endian 16-bit values."""
+    """Read a PGM or PPM file. Mitsuba's reader supports neither comments nor big-endian 16-bit values."""
     file.seek(head.length)
     stored = np.dtype(">u2" if head.highest > 255 else np.uint8)
     count = head.width * head.height * head.channels
@@ -127,7 +127,7 @@ def _pixmap(file: BinaryIO, head: PixmapHead) -> mi.Bitmap:
 
 
 def _radiance(file: BinaryIO, head: RadianceHead) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
-    """Read a Radiance HDR file, since Mitsuba's reader supports neither EXPOSURE nor scanline orders but -Y +X."""
+    """Read a Radiance HDR file. Mitsuba's reader supports neither EXPOSURE nor scanline orders other than -Y +X."""
     lines, columns = head.counts
     kind = "xyze" if head.xyz else "rgbe"
     file.seek(head.length)
@@ -215,10 +215,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
 
 def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Image:
-    """Resample an image with a Lanczos filter, clamped to the range of its values.
-
-    If ``crop`` is set, the image is first cropped around its centre to the new aspect ratio.
-    """
+    """Resample an image (Lanczos, clamped to its range), after a centre crop to the new aspect ratio if ``crop``."""
     if crop:
         h, w = image.shape[:2]
         keep_h, keep_w = min(h, round(w * height / width)), min(w, round(h * width / height))

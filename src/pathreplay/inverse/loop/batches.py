@@ -15,7 +15,7 @@ def batch(views: list[int], size: int | None, seed: int, iteration: int) -> list
     """
     n = len(views)
     if size is None or size >= n:
-        return views[::-1]  # the order affects the baselines of media; it is that of earlier versions
+        return views[::-1]  # reversed as in earlier versions, since the order affects the baselines of media
     number, k = divmod(iteration, -(-n // size))
     return [views[i] for i in _shuffled(seed, number, n)[k * size : (k + 1) * size]]
 

@@ -40,9 +40,7 @@ class Entry:
     errors: dict[str, float] = field(default_factory=dict)
     """Errors after the step: RMS errors of variables with a known true value, and errors of poses (`PoseError.of`)."""
     picture_error: float | None = None
-    """Root mean square error of the images without rendering noise, or None if the iteration does not measure it.
-
-    Only some iterations of a run with a baseline measure it."""
+    """RMS error of the images without rendering noise, measured in some iterations of runs with a baseline."""
     penalty: FiniteFloat = 0.0
     """Sum of all regularizers."""
     spp: NonNegativeInt = 0

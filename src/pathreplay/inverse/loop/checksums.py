@@ -61,10 +61,7 @@ def require_seal(path: Path) -> None:
 
 
 def with_sums(files: Mapping[str, Content]) -> dict[str, Content]:
-    """Add the file `SUMS` to a dictionary of files, as the last one.
-
-    Its content is generated after all other files have been written, because it lists their checksums.
-    """
+    """Add the file `SUMS` to files by name. Its content is generated after the other files have been written."""
     sums: dict[str, _Sum] = {}
 
     def summed(name: str, content: Content) -> Iterator[Chunk]:

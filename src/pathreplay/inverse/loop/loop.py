@@ -53,8 +53,7 @@ from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, s
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
 
-# Number of times that a job with a baseline measures the image error. Together, the measurements take a few per cent of
-# the time of the job.
+# Number of measurements of the image error in a job with a baseline. They take a few per cent of the job's time.
 JUDGEMENTS = 10
 
 # Smallest fraction of non-finite gradient entries for which an iteration counts towards `max_consecutive_nonfinite`.
@@ -158,10 +157,7 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
 
 
 def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
-    """Yield the events of `iterate`, whose steps run in the context `Problem.computing`.
-
-    The context does not apply to the code that receives the events.
-    """
+    """Yield the events of `iterate`. Its steps run inside `Problem.computing`, and observers of events outside."""
     events = iterate(problem, run, stop)
     while True:
         with problem.computing():
@@ -172,10 +168,7 @@ def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
 
 
 def require_gradients(problem: Problem, run: Run) -> None:
-    """Raise PathreplayError if at least half of a gradient was not finite in too many consecutive iterations.
-
-    The limit is `Config.max_consecutive_nonfinite`.
-    """
+    """Raise PathreplayError after `max_consecutive_nonfinite` iterations in which half of a gradient was not finite."""
     most = problem.config.max_consecutive_nonfinite
     last = run.history[-most:]
     if len(last) < most:
@@ -262,10 +255,7 @@ def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
 
 
 def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array], list[Event]]:
-    """Resample the grids whose next resolution is due, unless they are frozen.
-
-    Returns the values of all variables, and one event per resampled grid.
-    """
+    """Resample grids that are due for refinement and not frozen. Returns all values, and an event per such grid."""
     moving = [v for v in part.problem.variables if v.key in part.moving]
     due = {v.key: v.levels.shape_at(position) for v in moving if v.levels}
     due = {key: shape for key, shape in due.items() if values[key].shape != shape}
@@ -356,10 +346,7 @@ def _plain(problem: Problem, view: View, spp: int) -> Image:
 
 
 def ended(problem: Problem, run: Run) -> Run:
-    """Return the run with its resulting values, including the exposures of test views.
-
-    The run's baseline is changed in place, in the same way.
-    """
+    """Return the run with its resulting values and exposures of test views. The baseline is changed in place."""
     run = replace(run, values=best_values(problem, run))
     for each in filter(None, (run, run.baseline)):
         each.values = dict(with_exposures(problem, each.values))
@@ -367,10 +354,7 @@ def ended(problem: Problem, run: Run) -> Run:
 
 
 def with_exposures(problem: Problem, values: Arrays) -> Arrays:
-    """Return the values with exposures of the test views that are fitted to the targets.
-
-    The run does not optimise these exposures. The result is unchanged if the problem has no exposures or test views.
-    """
+    """Return the values with exposures of test views, which the run does not optimise, fitted to their targets."""
     if EXPOSURE not in values or not any(view.is_test for view in problem.views):
         return values
     put_values(problem, values)

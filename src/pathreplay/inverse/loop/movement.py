@@ -42,10 +42,7 @@ def parts_of(array: Array, mean: bool = False) -> list[float]:
 
 
 def window_of(history: Sequence[Entry], begin: int = 0) -> Sequence[Entry]:
-    """Return the last third of the iterations since ``begin``, but at least `SHORTEST` iterations.
-
-    The result is empty if fewer than `SHORTEST` iterations have been taken since ``begin``.
-    """
+    """Return the last third of the iterations since ``begin``, at least `SHORTEST`, or none if there are fewer."""
     count = len(history) - begin
     return history[-max(count // 3, SHORTEST) :] if count >= SHORTEST else ()
 

@@ -36,10 +36,8 @@ from pathreplay.scenes.parameters import get_array
 LARGE = 2**22
 """Number of entries from which the memory of a variable is managed explicitly (see `release`)."""
 MOST_SENSORS = 64
-"""Maximum number of sensors of a scene whose passes are recorded.
-
-The recording of each view contains all sensors. Memory therefore grows with the square of the number of sensors
-(measured: 3 MB per view with 50 sensors, 11 MB with 200)."""
+"""Maximum number of sensors of a scene whose passes are recorded. The recording of each view contains all sensors, so
+memory grows with the square of the number of sensors (measured: 3 MB per view with 50 sensors, 11 MB with 200)."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +71,7 @@ class Evaluation:
 Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]
 """evaluate(values, shard, learned): a pure function, up to rounding in sums over threads.
 
-``values`` are the decoded values (see `Form`) of all variables. ``learned`` is the state of the integrator after
-earlier evaluations.
+``values`` are the decoded values of all variables. ``learned`` is the integrator's state after earlier evaluations.
 """
 
 
@@ -214,10 +211,7 @@ class Evaluator:
         return total(each(), owned=True)
 
     def _know(self, learned: Arrays) -> None:
-        """Load the learned state into the integrator, unless it is already loaded.
-
-        Raises PathreplayError if the state belongs to another kind of integrator.
-        """
+        """Load the learned state. Raises PathreplayError if the state belongs to another kind of integrator."""
         held = self.integrator.baseline
         if (learned is self._learned and held is self._at) or (held is None and not learned):
             return
@@ -246,8 +240,7 @@ class Evaluator:
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
-        # One bad path must not end a long run. The sum is finite if and only if all entries are finite, and needs no
-        # temporary array.
+        # One bad path must not end a long run. A sum is finite if and only if all entries are, and needs no memory.
         broken = [key for key, gradient in gradients.items() if not np.isfinite(gradient.sum(dtype=np.float64))]
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:

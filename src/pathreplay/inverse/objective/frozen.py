@@ -25,8 +25,8 @@ from pathreplay.inverse.parameters.exposures import derivative
 from pathreplay.samplers.streams import Stream
 from pathreplay.scenes.parameters import keep_only
 
-# Part of every error message of Dr.Jit about a function that cannot be frozen. The cause are plugins that hide arrays
-# from Dr.Jit, in Mitsuba 3.9.1 `orthographic` and `thinlens`. Other such plugins are only known after an attempt.
+# Part of every error message of Dr.Jit about a function that cannot be frozen. Plugins that hide arrays from Dr.Jit
+# prevent freezing, e.g. `orthographic` and `thinlens` of Mitsuba 3.9.1. Only an attempt shows which plugins do so.
 _RECORDING = "while recording a frozen function"
 
 
@@ -106,10 +106,7 @@ class Recordings:
         target: ViewTarget,
         loss: ViewLoss,
     ) -> ViewResult:
-        """See the function `differentiate`.
-
-        Raises NotRecordable if recording fails. A part of the gradient may have been added to the parameters by then.
-        """
+        """See the function `differentiate`. Raises NotRecordable, possibly after adding a part of the gradient."""
         keys = list(params.keys())
         # One function per view, because Dr.Jit warns about functions that are recorded often.
         view = (request.sensor, *(dr.shape(params[key]) for key in keys))

@@ -26,10 +26,7 @@ class Batch:
 
     @staticmethod
     def of(weight: Array | None, size: tuple[int, int], most: int, seed: int) -> Batch | None:
-        """Draw up to ``most`` random pixels of an image of ``size`` (height, width).
-
-        Returns None if the image has at most ``most`` pixels.
-        """
+        """Draw ``most`` random pixels of an image of ``size`` (height, width); None if the image has no more pixels."""
         height, width = size
         n = height * width
         if most >= n:
@@ -48,10 +45,7 @@ class Batch:
 
 
 def obstacle(problem: Problem, integrator: StatefulIntegrator, sensor: int, spp: int, some: bool) -> str:
-    """Return why image and gradient cannot come from a single pass, or "" if they can.
-
-    The pass renders all pixels or, if ``some`` is set, a batch of pixels.
-    """
+    """Return why one pass over all pixels, or over ``some``, cannot give image and gradient, or "" if it can."""
     if problem.loss not in QUADRATIC:
         return "its loss is none of l2 and relative-l2; take one of these"
     return integrator.why_no_pixel_sweep(problem.scene, problem.scene.sensors()[sensor], spp, some)

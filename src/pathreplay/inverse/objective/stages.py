@@ -67,10 +67,7 @@ def _part(problem: Problem, number: int, stage: Stage) -> Part:
 
 
 def _views(problem: Problem, stage: Stage) -> set[str] | None:
-    """Return the names of the training views of a stage, or None if it uses all of them.
-
-    Raises PathreplayError if the stage names an unknown view or a test view.
-    """
+    """Return the names of a stage's views, or None for all. Raises PathreplayError for an unknown or test view."""
     if stage.sensors is None:
         return None
     ids = {view.name: problem.scene.sensors()[view.sensor].id() for view in problem.views}
@@ -183,10 +180,7 @@ def _means(image: Image, n: int) -> Image:
 
 
 class Staged:
-    """Evaluation function (see `Evaluate`) that applies the options of each shard's stage.
-
-    Only the evaluator of the current stage is kept in memory.
-    """
+    """Evaluation function (`Evaluate`) that applies the stage of each shard, and keeps one evaluator at a time."""
 
     def __init__(self, problem: Problem, integrator: mi.Integrator, plugin: Plugin, record: bool = True) -> None:
         self.problem, self.integrator, self.plugin, self.record = problem, integrator, plugin, record

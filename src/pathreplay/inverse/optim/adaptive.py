@@ -23,9 +23,7 @@ _FIRST, _SECOND, _GREATEST, _VELOCITY = "first", "second", "greatest", "velocity
 _KEPT = {"sgd": (_VELOCITY,), "rmsprop": (_SECOND,)}
 _MOMENTS = _FIRST, _SECOND, _GREATEST
 PIECE = 2**22
-"""Maximum number of entries that are stepped at once, which limits each temporary array of a step to 16 MB.
-
-Larger variables are stepped in pieces. Uniform variables (see `DrJitOptimiser`) are not split."""
+"""Maximum number of entries per step. Larger variables are stepped in pieces, to limit temporary arrays to 16 MB."""
 
 
 @dataclass(frozen=True)
@@ -107,10 +105,7 @@ class DrJitOptimiser:
         return self._parts[self._is_uniform(key)]
 
     def _pieces(self, key: str) -> dict[str, slice]:
-        """Return the pieces of a variable by their names in Dr.Jit's optimiser.
-
-        A uniform variable is a single piece, because its entries share one second moment.
-        """
+        """Return the pieces of a variable by their names in Dr.Jit's optimiser. Uniform variables are one piece."""
         size = prod(self._shapes[key])
         length = max(size, 1) if self._is_uniform(key) else self._piece
         return {f"{key}:{begin}": slice(begin, min(begin + length, size)) for begin in range(0, size, length)}

@@ -24,15 +24,13 @@ from pathreplay.inverse.optim.adaptive import State
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 MOST = 1000
-"""Maximum number of parameter entries. It limits the size of checkpoints, which contain the gradients of all
-iterations."""
+"""Maximum number of parameter entries, because checkpoints contain the gradients of all iterations."""
 
 ENDLESS = 10**9
 
 Vector = NDArray[np.float64]
 Search = Callable[..., object]
-"""Minimiser ``search(function, start, jac=True, bounds=...)``; see `LineSearch`. Its result may have the attributes
-``success`` and ``message``, as in SciPy."""
+"""Minimiser ``search(function, start, jac=True, bounds=...)``, whose result may be any object; see `LineSearch`."""
 _START, _SCALE, _LOSSES, _GRADIENTS, _NEXT = (f"search:{n}" for n in ("start", "scale", "losses", "gradients", "next"))
 
 

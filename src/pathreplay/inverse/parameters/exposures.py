@@ -1,8 +1,8 @@
 """Exposures: scale factors on the rendered image of each view, recovered as one additional variable.
 
 The loss f compares the product of a factor e and the image I with the target T. The derivative of the loss with respect
-to e is f'(e I, T) I. A single rendering for both occurrences of I would bias e towards small values, because their
-noise would be correlated. The estimator f'(e A, T) B therefore uses two independent renderings A and B.
+to e is f'(e I, T) I. If both occurrences of I were the same rendering, their noise would be correlated and bias e
+towards small values. The estimator f'(e A, T) B therefore uses two independent renderings A and B.
 """
 
 from __future__ import annotations
@@ -61,10 +61,7 @@ def start(views: int, channels: int, white_balance: bool) -> Array:
 
 
 def factor_of(values: Arrays, view: int, channels: int) -> Image | None:
-    """Return the factor on the image of a view, or None if the problem has no exposures.
-
-    The shape is (1, 1, channels). The factor of an alpha channel is 1.
-    """
+    """Return the factors (1, 1, channels) on the image of a view, with 1 for alpha, or None without exposures."""
     if EXPOSURE not in values:
         return None
     row = values[EXPOSURE][view]
@@ -111,10 +108,7 @@ def gradient(values: Arrays, view: int, by_log: Array) -> Array:
 
 
 def fitted(picture: Image, target: Image, weight: Image | None, each: bool) -> Array:
-    """Fit the factors on an image to its target by weighted least squares.
-
-    The result has one factor per colour if ``each`` is set, and otherwise one factor for all colours.
-    """
+    """Fit factors on an image to its target by least squares: one per colour if ``each``, or one for all colours."""
     colours = picture.shape[2] - (picture.shape[2] in (2, 4))
     w = np.ones((1, 1, 1)) if weight is None else weight.astype(np.float64)
     a, t = (image[:, :, :colours].astype(np.float64) for image in (picture, target))
@@ -125,9 +119,7 @@ def fitted(picture: Image, target: Image, weight: Image | None, each: bool) -> A
 
 
 def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Image, Image, Image | None]]) -> Arrays:
-    """Return the values with fitted factors for test views.
-
-    The optimisation does not determine these factors, because test views are not part of the loss.
+    """Return the values with fitted factors for the test views, which are not part of the loss.
 
     Args:
         values: values by key.
@@ -140,11 +132,7 @@ def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Imag
 
 
 def fixed_rows(names: Iterable[str], trained: Iterable[int], reference: str | None, free: bool) -> list[int]:
-    """Return the rows whose geometric mean `Factors` fixes.
-
-    The result is empty if ``free`` is set. Otherwise, it is the row of the reference view, or the rows of all training
-    views if there is no reference.
-    """
+    """Return the rows whose mean `Factors` fixes: the reference view or all training views, or no row if ``free``."""
     if free:
         return []
     return list(trained) if reference is None else [list(names).index(reference)]

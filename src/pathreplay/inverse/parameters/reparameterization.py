@@ -13,8 +13,7 @@ from pathreplay.inverse.config.parameter_options import TransformKind
 from pathreplay.inverse.parameters.values import Array
 
 CLOSEST = 1e-6
-"""Minimum distance of values from a bound, relative to the range. Any closer, the derivative with respect to u would
-vanish."""
+"""Minimum distance from a bound, relative to the range. Any closer, the derivative with respect to u would vanish."""
 
 LARGEST_LOG = 88.0
 """Maximum logarithm of a value. The exponential of a larger number overflows in single precision."""
@@ -98,7 +97,7 @@ class Transform:
         return np.asarray(self._inside(v), np.float32)
 
     def _inside(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Clamp the values to a small distance from the bounds."""
+        """Clamp the values to keep a small distance from the bounds (see `CLOSEST`)."""
         v = values.astype(np.float64)
         if self.kind == "logit":
             off = CLOSEST * (self.upper - self.lower)

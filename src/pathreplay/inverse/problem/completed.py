@@ -48,10 +48,7 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
 
 
 def _options(own: mi.Integrator | None) -> Json:
-    """Return the options of `pathreplay` that correspond to those of the scene's integrator.
-
-    The result is empty if the scene has no integrator, or if its limits cannot be read.
-    """
+    """Return options of `pathreplay` that correspond to the scene's integrator; empty if its limits are unknown."""
     limits = None if own is None else read_limits(own)
     if own is None or limits is None:
         return {}

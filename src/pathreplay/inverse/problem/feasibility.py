@@ -14,7 +14,7 @@ from pathreplay.inverse.losses.pixelwise import Loss, mean_loss
 
 
 def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Raise PathreplayError if the scene has no shapes, and one of ``keys`` is of neither an emitter nor a sensor."""
+    """Raise PathreplayError if the scene has no shapes, and a key belongs to neither an emitter nor a sensor."""
     if scene.shapes():
         return
     visible = {

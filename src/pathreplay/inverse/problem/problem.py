@@ -113,10 +113,7 @@ class Problem:
 
     @contextmanager
     def computing(self) -> Iterator[None]:
-        """Return a context for evaluations.
-
-        In the context, deterministic jobs use one thread, and errors of integrators become PathreplayErrors.
-        """
+        """Return a context in which deterministic jobs use one thread, and integrators raise PathreplayError."""
         config = self.config
         names = "' or '".join(plugin.type for plugin in (config.integrator, config.baseline) if plugin is not None)
         with one_thread(config.deterministic), errors_as(f"Integrator '{names}' cannot do this job"):
@@ -152,8 +149,7 @@ class Problem:
 
 def variables_of(problem: Problem, values: Arrays) -> dict[str, dr.ArrayBase]:
     """Convert the decoded values of the variables to evaluated Dr.Jit arrays that own their memory."""
-    # The product makes a copy. Dr.Jit would otherwise wrap NumPy's memory, whose varying alignment would force frozen
-    # functions to record again.
+    # Copy by a product. NumPy's memory has varying alignments, which would force frozen functions to record again.
     one = dr.opaque(mi.Float, 1)
     variables = {v.key: v.held(values[v.key]) * one for v in problem.variables}
     dr.eval(variables)
@@ -312,10 +308,7 @@ def build_problem(
 def _loaded(
     config: Config, base: Path, shots: Mapping[str, Shot], given: InMemory
 ) -> tuple[mi.Scene, Config, tuple[str, ...]]:
-    """Load the scene and fill in the default integrators of the job.
-
-    Returns the scene, the completed job, and notes for the user.
-    """
+    """Load the scene and fill in default integrators. Returns scene, completed job, and notes for the user."""
     if given.scene is not None:
         config, differences = completed(config, given.scene, given.integrator)
         return given.scene, config, differences
@@ -340,10 +333,7 @@ class _Opened:
 def _seen(
     config: Config, targets: Targets | None, shots: Mapping[str, Shot], opened: _Opened, base: Path, disk: DiskStore
 ) -> tuple[Targets, dict[str, Array], tuple[str, ...]]:
-    """Read or render the targets unless they are given.
-
-    Returns the targets, the true values of parameters by key, and notes for the user.
-    """
+    """Read or render the targets if none are given. Returns targets, true values by key, and notes for the user."""
     truth: dict[str, Array] = {}
     notes: tuple[str, ...] = ()
     first = targets is None
@@ -395,10 +385,7 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
 def _pictures(
     config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path, disk: DiskStore
 ) -> tuple[Targets, tuple[str, ...]]:
-    """Read the targets from the files of a capture, or from files that the job names.
-
-    Returns the targets, and notes for the user.
-    """
+    """Read the targets from the files of a capture or of the job. Returns targets, and notes for the user."""
     how = Reading(config.target.alpha, hidden=bool((config.integrator.model_extra or {}).get("hide_emitters")))
     if config.capture is None:
         files = by_view("target images", config.target.images or [], sensors, base)
