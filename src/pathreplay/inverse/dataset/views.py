@@ -28,7 +28,7 @@ class View:
     is_test: bool = False
     """Whether this is a test view, which is not part of the loss."""
     share: float = 1.0
-    """Weight of the view in the loss; the mean over the training views is 1."""
+    """Weight of the view in the loss. The weights of the training views have the mean 1."""
 
 
 def sensors_of(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int]:

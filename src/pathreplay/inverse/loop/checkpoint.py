@@ -52,7 +52,7 @@ class Entry:
     slopes: dict[str, list[float]] = field(default_factory=dict)
     """Sums of each gradient over parts of its variable (see `movement`)."""
     means: dict[str, list[float]] = field(default_factory=dict)
-    """Means of the values over the same parts, after the step."""
+    """Means of the values over parts of each variable, after the step (see `movement`)."""
 
 
 @dataclass
@@ -67,7 +67,7 @@ class Run:
     """Statistics that evaluations pass on to later evaluations, such as the learned baselines of media, by name."""
     history: list[Entry] = field(default_factory=list)
     baseline: Run | None = None
-    """A run of another integrator from the same initial values and in the same time."""
+    """A run of another integrator for comparison, with the same initial values and the same computation time."""
     whole: bool = True
     """False during a step, when the state is inconsistent and cannot be saved."""
 
@@ -125,7 +125,7 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Col
 def _read(
     path: Path, values: Arrays, levels: Mapping[str, Levels | None], held: Collection[str]
 ) -> tuple[dict[str, Array], State, list[Entry], Arrays]:
-    """Read values, optimiser state, history and learned statistics. `restore` translates the errors of the function."""
+    """Read values, optimiser state, history and learned statistics. `restore` translates the errors raised here."""
     if not path.is_file():
         raise ValueError("no such file")
     with safetensors.safe_open(str(path), framework="numpy") as file:

@@ -317,7 +317,7 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
     stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates, loss)
     stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
-        if not np.isfinite(value.sum(dtype=np.float64)):  # if and only if all entries are finite
+        if not np.isfinite(value.sum(dtype=np.float64)):  # a sum is finite if and only if all entries are
             raise PathreplayError(
                 f"'{key}' is not finite after iteration {len(run.history)}; lower its learning rate, or bound it"
             )

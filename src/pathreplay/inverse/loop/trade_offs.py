@@ -34,7 +34,7 @@ MOST_SAMPLES, FREE_SAMPLES, SHARE = 16, 2**22, 0.1
 STEP = 0.01
 """Size of a perturbation, as a fraction of the sum of value, change during the run and learning rate."""
 UNDONE = 0.05
-"""Sine of the angle below which two parameters are a trade-off: the fraction of a change that the other cannot undo."""
+"""Sine of the angle below which two parameters are a trade-off. This fraction of a change cannot be undone."""
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Columns of the Jacobian by variable, shape (pixels, entries)."""

@@ -98,7 +98,7 @@ class Total:
         self._count += 1
 
     def _room(self, key: str) -> Array | None:
-        """Return the array of a sum if it may be overwritten, else None. Arrays from other processes are read-only."""
+        """Return the array of a sum if it may be overwritten, or None. Arrays from other processes are read-only."""
         here = self._sums[key]
         return here if self._owned and here.flags.writeable else None
 

@@ -47,7 +47,7 @@ def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> 
 
 
 def require_values(sizes: Mapping[str, int]) -> None:
-    """Raise PathreplayError unless variables with ``sizes`` entries, by key, and optimiser state fit into memory."""
+    """Raise PathreplayError unless variables of these ``sizes``, by key, and their optimiser state fit into memory."""
     largest = max(sizes, key=lambda key: sizes[key])
     thing = f"Optimising {sum(sizes.values())} numbers ('{largest}' has {sizes[largest]})"
     memory.require(sum(sizes.values()) * _A_VALUE, thing, "use fewer parameters, or coarser textures and volumes")
