@@ -1,4 +1,4 @@
-"""Validation errors of a job as one-line messages in terms of its file, made from pydantic's errors."""
+"""Convert pydantic's validation errors of a job to one-line messages in terms of the job's file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from pathreplay.errors import shown
 
-# Remedy by pydantic's error type; the messages of other types contain it.
+# Remedies by pydantic's error type. Messages of other error types already contain the remedy.
 _INSTEAD = {
     "int_type": "write an integer such as 16",
     "float_type": "write a number such as 0.5",
@@ -23,7 +23,7 @@ _INSTEAD = {
     "finite_number": "write a finite number",
     "json_invalid": "fix the syntax there",
 }
-# Keys whose values have several types -> those types in words.
+# Descriptions of the accepted types, for keys that accept several types.
 _KINDS = {
     "initial": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
     "values": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
@@ -35,7 +35,7 @@ _KINDS = {
     "masks": "file names, or a pattern such as 'masks/*.png'",
 }
 
-# Old keys -> new keys; where several are given, the one that the table has.
+# New names of renamed keys. If there are several new names, the one that exists in the table applies.
 RENAMED = {
     "rival": "baseline",
     "learning_rate_decay": "final_learning_rate_ratio",
@@ -70,10 +70,10 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
     Args:
         error: pydantic's error for a whole job.
         job: model of the job.
-        tables: models of its sub-tables, by key.
+        tables: models of the tables in the job, by key.
     """
     details = error.errors()
-    # A value of a union type fails once per alternative; an unknown key is the most telling of these failures.
+    # A value of a union type fails once per alternative. An unknown key is the most telling of these failures.
     first = next((e for e in details if e["type"] == "extra_forbidden"), details[0])
     where = ".".join(_path(first["loc"])) or "the job"
     if first["type"] == "extra_forbidden":
@@ -88,7 +88,7 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
         return f"key '{where}' is missing; add it"
     if first["type"] == "value_error":
         reason = str(first["ctx"]["error"])
-        # Validators of tables name the table in their message; validators of numbers do not.
+        # Validators of tables name the table in their messages. Validators of numbers do not name the key.
         return f"'{where}': {reason}" if isinstance(first["input"], Real) else reason
     # If several alternatives failed, describe all types that the key accepts.
     kinds = next((kinds for key, kinds in _KINDS.items() if key in _path(first["loc"])), None)

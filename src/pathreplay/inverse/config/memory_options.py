@@ -12,7 +12,7 @@ from pathreplay.errors import shown
 UNITS = {"MB": 10**6, "GB": 10**9, "TB": 10**12, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
 PATTERN = r"^\s*(\d{1,9}(?:\.\d{1,9})?)\s*(MB|GB|TB|MiB|GiB|TiB)\s*$"
 LEAST = 2**29
-"""Smallest limit in bytes; Python, Mitsuba, Dr.Jit and compiled kernels use most of it."""
+"""Smallest memory limit in bytes. Python, Mitsuba, Dr.Jit and compiled kernels use most of this amount."""
 
 
 def bytes_of(text: str) -> int:

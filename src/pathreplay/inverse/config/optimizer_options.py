@@ -1,4 +1,4 @@
-"""Optimisers of a job, their options and the defaults of these."""
+"""Optimisers of a job, their options, and default values of the options."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Optimizer(Table):
 
     @property
     def searches(self) -> bool:
-        """Whether it compares losses between iterations, which then all use the same random numbers."""
+        """Whether the optimiser compares losses between iterations, all of which then use the same random numbers."""
         return self.type == "l-bfgs-b"
 
     def options(self) -> Json:
@@ -66,7 +66,8 @@ class Optimizer(Table):
 
 _ADAM = {
     "beta_1": 0.9,
-    # The second moment averages over about 1 / (1 - beta_2) steps; with the usual 0.999, more than most runs have.
+    # The second moment averages over about 1 / (1 - beta_2) steps. With the usual value of 0.999, these are more steps
+    # than most runs have.
     "beta_2": 0.99,
     "epsilon": 1e-8,
     "uniform": False,
@@ -77,6 +78,6 @@ DEFAULTS: dict[str, dict[str, float | bool]] = {
     "adamw": {**_ADAM, "weight_decay": 0.01},
     "sgd": {"momentum": 0.0, "nesterov": False},
     "rmsprop": {"alpha": 0.99, "epsilon": 1e-8},
-    # Relative to the initial loss; smaller decreases are within the rounding error of single precision.
+    # The tolerance is relative to the initial loss. Smaller decreases are within the rounding error of float32.
     "l-bfgs-b": {"history_size": 10, "tolerance": 1e-6},
 }

@@ -117,7 +117,7 @@ class Parameter(Table):
 
     @property
     def displacement(self) -> Displacement:
-        """Initial displacement of a pose relative to the scene; empty if the job gives none."""
+        """Initial displacement of a pose relative to the scene. It is empty if the job gives no displacement."""
         return self.initial if isinstance(self.initial, Displacement) else Displacement()
 
     @model_validator(mode="after")
@@ -153,7 +153,7 @@ class Parameter(Table):
                 "steps; remove one"
             )
         sizes, begins = self.resolutions or [], self.refine_at or []
-        # Without refine_at, the stages of the job may define the iterations: see `Config.refine_at`.
+        # Without refine_at, the stages of the job may define the iterations (see `Config.completed_entry`).
         if self.refine_at is not None and len(begins) != max(0, len(sizes) - 1):
             self._refuse_count()
         if sorted(set(begins)) != begins:

@@ -1,4 +1,4 @@
-"""Parse a job from TOML, JSON or YAML into dictionaries; syntax errors become one-line messages."""
+"""Parse a job from TOML, JSON or YAML into dictionaries. Syntax errors become one-line messages."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ else:
     import tomli as tomllib
 
 YAML = (".yaml", ".yml")
-"""Suffixes of YAML files; `.json` selects JSON, any other suffix TOML."""
+"""Suffixes of YAML files. The suffix `.json` selects JSON, and any other suffix TOML."""
 
 _LONGEST, _LONGEST_YAML = 64 * 2**20, 2**18
-"""Largest size of a file in bytes; a larger one is not a job. PyYAML takes seconds for 2**18 bytes."""
+"""Maximum size of a job file in bytes, for TOML or JSON and for YAML. PyYAML takes seconds for 2**18 bytes."""
 
 _DEEPEST = 64
-"""Deepest nesting of YAML; PyYAML recurses by several stack frames per level."""
+"""Maximum nesting depth of YAML. PyYAML uses several stack frames per level."""
 
 
 def most_bytes(path: Path) -> int:

@@ -38,7 +38,7 @@ _NAMES = {
 
 
 def reference() -> str:
-    """Return the page."""
+    """Return the reference as a Markdown page."""
     schema = Config.model_json_schema()
     tables = [_table("The job", schema)]
     tables += [_table(f"`{title}`", schema["$defs"][name]) for name, title in _TITLES.items()]
@@ -61,7 +61,7 @@ def _default(about: Json) -> str:
 
 
 def _kind(about: Json) -> str:
-    """Describe the types of a key's values; ranges are left to the error messages."""
+    """Describe the types of a key's values. Only error messages describe the ranges of values."""
     return " or ".join(dict.fromkeys(_kinds(about)))
 
 

@@ -11,8 +11,8 @@ Schedule = Literal["exponential", "linear", "cosine", "constant"]
 def rate(schedule: Schedule, position: int, iterations: int, decay: float, warmup_steps: int = 0) -> float:
     """Return the factor on the learning rate at iteration ``position``.
 
-    With x = position / iterations it is decay^x (exponential), 1 - (1 - decay) x (linear),
-    decay + (1 - decay) (1 + cos πx) / 2 (cosine) or 1 (constant). During warm-up it is multiplied by
+    With x = position / iterations, the factor is decay^x (exponential), 1 - (1 - decay) x (linear),
+    decay + (1 - decay) (1 + cos πx) / 2 (cosine) or 1 (constant). During warm-up, the factor is multiplied by
     (position + 1) / (warmup_steps + 1).
 
     Args:

@@ -29,7 +29,7 @@ from pathreplay.platform.files import MISSING, file_problem
 from pathreplay.types import Json
 
 PIXELWISE = ("l2", "relative-l2")
-"""Losses that support pixel batches: the names of `losses.QUADRATIC`."""
+"""Losses that support pixel batches: the names of the losses in `pixelwise.QUADRATIC`."""
 
 # Streams of random seeds: iterations, targets and rendered images never share a seed.
 ITERATION, TARGET, PICTURE, JUDGEMENT, BATCH = 0, 1, 2, 3, 4
@@ -136,11 +136,11 @@ class Config(Table):
 
     @property
     def parts(self) -> int:
-        """Number of shards per view and iteration: `spp_shards`, times two halves if the noise is measured."""
+        """Number of shards per view and iteration: `spp_shards`, or twice as many if the noise is measured."""
         return self.spp_shards * (2 if self.halves_samples else 1)
 
     def completed_entry(self, entry: Parameter) -> Parameter:
-        """Return the table of a parameter with its learning rate, and the iterations at which resolutions begin."""
+        """Return the table of a parameter, with missing values of learning rate and refinement iterations filled in."""
         refine_at = entry.refine_at or []
         if entry.refine_at is None and entry.resolutions is not None and self.stages is not None:
             refine_at = begins(self.stages)[1 : len(entry.resolutions)]
@@ -149,7 +149,7 @@ class Config(Table):
 
     @property
     def target_source(self) -> tuple[str, dict[str, Argument]]:
-        """The scene of rendered targets, and the arguments of a built-in one: those of the job by default."""
+        """The scene of rendered targets, and its arguments; default: the scene and the arguments of the job."""
         target = self.target
         return (
             self.scene if target.scene is None else target.scene,
@@ -161,7 +161,7 @@ class Config(Table):
         total = begins(self.stages or [])[-1]
         if self.stages is not None:
             if "iterations" not in self.model_fields_set:
-                # The model is frozen, and the key must not count as given when the job is saved.
+                # Assigned in __dict__, because the model is frozen, and the key must not count as given in a saved job.
                 self.__dict__["iterations"] = total
             elif self.iterations != total:
                 raise ValueError(
@@ -210,7 +210,7 @@ class Config(Table):
             "final_learning_rate_ratio" in self.model_fields_set
             and "learning_rate_schedule" not in self.model_fields_set
         ):
-            # The model is frozen, and the key must not count as given when the job is saved.
+            # Assigned in __dict__, because the model is frozen, and the key must not count as given in a saved job.
             self.__dict__["learning_rate_schedule"] = "exponential"
         if self.learning_rate_schedule == "constant" and "final_learning_rate_ratio" in self.model_fields_set:
             raise ValueError(
@@ -293,7 +293,7 @@ class Config(Table):
         return self
 
     def seeds(self, stream: int, sensor: int, iteration: int = 0, count: int = 2) -> tuple[int, ...]:
-        """Return ``count`` independent 32-bit seeds; they differ between streams, sensors and iterations."""
+        """Return ``count`` independent 32-bit seeds, which differ between streams, sensors and iterations."""
         return tuple(np.random.SeedSequence([self.seed, stream, iteration, sensor]).generate_state(count).tolist())
 
 
@@ -332,7 +332,7 @@ def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
 
 
 def read_table(path: Path, changes: Sequence[str] = ()) -> Any:
-    """Read the file of a job without checking it; see `load_config`. Raises PathreplayError if it cannot be read."""
+    """Read a job as `load_config` does, without checking it. Raises PathreplayError if the file cannot be read."""
     problem = file_problem(path, most_bytes(path))
     if problem == MISSING:
         siblings = path.parent.glob("*") if path.parent.is_dir() else []
@@ -350,7 +350,7 @@ def read_table(path: Path, changes: Sequence[str] = ()) -> Any:
 
 
 def make_config(values: Json, name: str = "config") -> Config:
-    """Make a job from a dictionary, with the checks and messages of `load_config`; messages call it ``name``."""
+    """Make a job from a dictionary, with the checks and messages of `load_config`. Messages call the job ``name``."""
     return _checked(name, values)
 
 

@@ -42,5 +42,5 @@ def begins(stages: Sequence[Stage]) -> list[int]:
 
 
 def place(stages: Sequence[Stage], iteration: int) -> int:
-    """Return the index of the stage that an iteration belongs to; beyond the end, the last stage."""
+    """Return the index of the stage that an iteration belongs to. The last stage includes all later iterations."""
     return min(sum(begin <= iteration for begin in begins(stages)[1:]), len(stages) - 1)

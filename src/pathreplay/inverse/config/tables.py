@@ -32,7 +32,7 @@ def _single(value: object) -> object:
 
 
 LARGEST = float(np.finfo(np.float32).max)
-# Strict: true is not accepted for 1, nor "16" for 16. NumPy scalars are accepted.
+# Types are strict: neither true nor "1" is accepted for 1. NumPy scalars are accepted.
 Whole = Annotated[int, Field(strict=True), BeforeValidator(_whole)]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), BeforeValidator(_single)]
 Positive = Annotated[Finite, Field(gt=0)]
@@ -49,7 +49,7 @@ class Table(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _is_a_table(cls, value: object) -> object:
-        """Reject mappings other than dictionaries: a Dr.Jit optimizer is a mapping, but holds none of the keys."""
+        """Reject mappings other than dictionaries, such as Dr.Jit optimizers, which have none of the keys."""
         if isinstance(value, Mapping) and not isinstance(value, dict):
             raise PydanticCustomError("table_type", "input should be a dictionary")
         return value

@@ -28,7 +28,7 @@ DEEPEST = 8
 
 @dataclass(frozen=True)
 class Imported:
-    """A user function with its name in messages: the kind ('Loss') and the import path ('module:function')."""
+    """A user function. Messages name the function by its kind, e.g. 'Loss', and its import path 'module:function'."""
 
     kind: str
     name: str
@@ -40,7 +40,7 @@ class Imported:
     def __call__(self, convert: Callable[[object], T], *args: object) -> T:
         """Call the function and return its value, converted by ``convert``.
 
-        Raises PathreplayError if either of them raises, or if the return value is not numeric.
+        Raises PathreplayError if the function or the conversion raises, or if the return value is not numeric.
         """
         try:
             with _same_variant(str(self)):
@@ -55,9 +55,10 @@ class Imported:
 
 
 class Modules:
-    """Finds and imports user functions: modules in the folder ``base`` come before installed ones.
+    """Finds and imports user functions.
 
-    A module is executed once. ``given`` maps names to callables, which take precedence over modules.
+    Modules in the folder ``base`` take precedence over installed modules. Each module is executed once. ``given`` maps
+    names to callables, which take precedence over modules.
     """
 
     def __init__(self, base: Path | None = None, given: Mapping[str, Callable[..., object]] | None = None) -> None:
@@ -124,7 +125,7 @@ class Modules:
 
 @contextmanager
 def _same_variant(who: str) -> Iterator[None]:
-    """Restore Mitsuba's variant if the block changed it, and raise PathreplayError; its message begins with ``who``."""
+    """Restore Mitsuba's variant if the block changed it, and raise a PathreplayError that begins with ``who``."""
     before = mi.variant()
     yield
     if (after := mi.variant()) != before:
@@ -141,10 +142,10 @@ def _why(error: BaseException) -> str:
 
 
 def _no_numbers(value: object, depth: int = 0) -> str:
-    """Describe a value that Dr.Jit cannot convert to an array; return "" if it can.
+    """Describe a value that Dr.Jit cannot convert to an array. Returns "" if Dr.Jit can convert the value.
 
-    The check is needed because Dr.Jit's constructors iterate over any sequence. The elements of a string are strings
-    again, so a constructor would recurse forever, uninterruptible by signals.
+    The check is needed because Dr.Jit's constructors iterate over any sequence. The elements of a string are again
+    strings, so a constructor would recurse forever and could not be interrupted by signals.
     """
     if isinstance(value, (list, tuple)):
         if depth == DEEPEST:

@@ -1,7 +1,7 @@
-"""Captures: images with camera poses, from a `transforms.json` or a COLMAP model, as Mitsuba sensors.
+"""Read captures (images with camera poses) from a `transforms.json` or a COLMAP model, and make Mitsuba sensors.
 
-The cameras of `Photo` look along -z with x to the right and have focal lengths in pixels. Mitsuba's cameras look along
-+z with x to the left and have a field of view.
+The cameras of `Photo` look along -z with x to the right, and are specified by focal lengths in pixels. Mitsuba's
+cameras look along +z with x to the left, and are specified by a field of view.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ def read_capture(
     """Read a capture.
 
     Args:
-        capture: its table in the job.
+        capture: table of the capture in the job.
         base: folder that relative paths start from.
         size_of: returns the width and height of an image file.
         pixel_format: pixel format of the films.
 
     Returns:
-        The shots by name, in the order of the capture.
+        The images with their cameras (`Shot`), by name, in the order of the capture.
 
     Raises:
         PathreplayError: a file cannot be read, a lens model is not supported, or a camera pose is not rigid.
@@ -87,7 +87,7 @@ def fingerprint(shots: Iterable[Shot]) -> str:
 
 
 def _mask(photo: Photo, masks: Path) -> Path:
-    """Find the mask of a photo: its file name with '.png' appended, or in place of its suffix."""
+    """Find the mask of a photo, named like the photo with '.png' appended, or with '.png' in place of the suffix."""
     image = photo.image.name
     mask = next((p for n in (f"{image}.png", f"{photo.image.stem}.png") if not file_problem(p := masks / n)), None)
     if mask is None:
@@ -96,7 +96,7 @@ def _mask(photo: Photo, masks: Path) -> Path:
 
 
 def _names(files: list[str]) -> list[str]:
-    """Make unique names that are valid for sensors and files: file names, with folders if these are ambiguous."""
+    """Make unique names, valid for sensors and files, from the file names or, if these are ambiguous, the paths."""
     names = [Path(file).stem for file in files]
     if len(set(names)) < len(names):
         names = [str(Path(file).with_suffix("")) for file in files]

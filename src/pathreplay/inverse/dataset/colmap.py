@@ -1,4 +1,4 @@
-"""Read the cameras and images of a COLMAP model, text or binary; points, rigs and frames are ignored.
+"""Read the cameras and images of a COLMAP model in text or binary format. Points, rigs and frames are ignored.
 
 See https://colmap.github.io/format.html for the formats. pycolmap is not used, because it takes 135 MB, requires the
 points of a model, and accepts cameras whose position is NaN.
@@ -29,7 +29,7 @@ MODELS: dict[str, tuple[int, str]] = {
     "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
     "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
 }
-"""Lens models: number in binary files, and names of the parameters."""
+"""Supported lens models: for each name, the number in binary files and the names of the parameters."""
 NUMBERS = {number: name for name, (number, _) in MODELS.items()}
 
 MOST_BYTES = 8 * 2**30
@@ -61,7 +61,7 @@ def photos_of_colmap(
     Args:
         folder: folder of the model.
         images: folder of the images; default: ``../../images`` relative to the model.
-        masks: folder of masks, named as COLMAP does: the file name of the image with '.png' appended.
+        masks: folder of masks. A mask is named like its image with '.png' appended, as in COLMAP.
         size_of: returns the width and height of an image file.
 
     Raises:
@@ -142,7 +142,7 @@ def _known(model: str) -> str:
 
 
 def _place(where: str, posed: _Posed) -> np.ndarray:
-    """Return the camera-to-world matrix of a camera that looks along -z with y up; COLMAP's look along +z, y down."""
+    """Return the camera-to-world matrix of an image, with y up and view along -z (COLMAP: y down, view along +z)."""
     q, t = np.array(posed.quaternion), np.array(posed.translation)
     length = float(np.linalg.norm(q)) if np.isfinite(q).all() else math.nan
     if not abs(length - 1) < UNIT or not (np.abs(t) < 1e9).all():

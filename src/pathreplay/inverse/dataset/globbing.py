@@ -16,9 +16,9 @@ MOST_FILES = 100_000
 
 
 def matching(names: Iterable[str], base: Path) -> Iterator[str]:
-    """Yield each name or, if its last part has wildcards (photos/*.png), the matching files in natural order.
+    """Yield the names, after replacing wildcards in their last part (photos/*.png) by matching files in natural order.
 
-    Raises PathreplayError if no file matches a pattern, or the name of a folder has wildcards.
+    Raises PathreplayError if no file matches a pattern, or if the name of a folder has wildcards.
     """
     for name in names:
         if WILD.search(name) and not _exists(base / name):

@@ -1,4 +1,4 @@
-"""Target images and pixel weights, rendered from a target scene or read from files, and true parameter values."""
+"""Target images and pixel weights from a target scene or from files, and true parameter values from a target scene."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from pathreplay.scenes.image_files import MOST_PIXELS
 from pathreplay.scenes.loading import load_scene_with_floats
 from pathreplay.scenes.stored import form_of
 
-# Bytes per pixel of a view: the target, initial and final image are kept, in memory up to `ROOM`, then on disk.
+# Bytes per pixel of a view, for its target, initial and final image. Images beyond `ROOM` bytes are on disk.
 _A_VIEW = 36
 
 
@@ -53,7 +53,7 @@ class Targets:
     images: dict[str, Image]
     """Linear images, shape (height, width, channels)."""
     weights: dict[str, Image]
-    """Weights of the pixels with mean 1, shape (height, width, 1); views without an entry weight all pixels equally."""
+    """Weights of the pixels with mean 1, shape (height, width, 1). Views without an entry weight all pixels equally."""
 
     @staticmethod
     def of(views: Iterable[View]) -> Targets:
@@ -66,7 +66,7 @@ class Targets:
 def target_scene(
     spec: str, arguments: Mapping[str, Argument], given: Mapping[str, Value], wanted: Sequence[str], base: Path
 ) -> mi.Scene:
-    """Load the target scene and set its ``given`` values; 8-bit textures among the ``wanted`` keys become floats."""
+    """Load the target scene and set its ``given`` values. 8-bit textures with given or wanted keys become floats."""
     scene = load_scene_with_floats(spec, [*given, *wanted], base, **arguments)
     params = traversed(scene)
     parameters.require_finite(params)
@@ -82,7 +82,7 @@ def target_scene(
 
 
 def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> dict[str, Array]:
-    """Return the true values of parameters, as far as the target scene has them in a comparable shape.
+    """Return the true values of those parameters that the target scene has in a `comparable` shape.
 
     Args:
         scene: the target scene.
@@ -97,7 +97,7 @@ def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> d
 def rendered_targets(
     target: Target, seeds: Mapping[str, int], scene: mi.Scene, sensors: dict[str, int], disk: DiskStore
 ) -> dict[str, Image]:
-    """Render the targets of all views, with a seed for each. Raises PathreplayError if the scene lacks a sensor."""
+    """Render the targets of all views, each with its own seed. Raises PathreplayError if the scene lacks a sensor."""
     plugin = target.integrator
     assert plugin is not None  # set by `completed`
     integrator = load_integrator(plugin.model_dump())
@@ -120,7 +120,7 @@ def rendered_targets(
 
 @dataclass(frozen=True)
 class Reading:
-    """How image files of targets are read."""
+    """Options for reading the image files of targets."""
 
     alpha: str
     """Treatment of the alpha channel, see `Target.alpha`."""
@@ -139,7 +139,7 @@ def read_targets(
 
     Args:
         files: image file of each view.
-        how: what is done to the images.
+        how: options for reading.
         scene: scene of the job.
         sensors: index of the sensor of each view.
         base: folder that relative paths start from.
@@ -225,9 +225,9 @@ def read_masks(
     resize: bool = False,
     lenses: Mapping[str, Lens] = MappingProxyType({}),
 ) -> dict[str, Image]:
-    """Read mask files as weights of the pixels, by view; black pixels get the weight 0.
+    """Read mask files as weights of the pixels, by view. Black pixels get the weight 0.
 
-    The arguments and errors are those of `read_targets`.
+    See `read_targets` and `Reading` for arguments and errors.
     """
     weights: dict[str, Image] = {}
     for name, file in files.items():
@@ -251,7 +251,7 @@ def masked(targets: Targets, masks: Mapping[str, Image]) -> Targets:
 
 
 def require_weights(targets: Targets, masked: set[str]) -> None:
-    """Raise PathreplayError unless exactly the views ``masked`` have weights, and these are valid."""
+    """Raise PathreplayError unless exactly the views ``masked`` have weights, and these weights are valid."""
     for name, image in targets.images.items():
         weight = targets.weights.get(name)
         shape = (*image.shape[:2], 1)
@@ -274,7 +274,7 @@ def by_view(what: str, files: list[str] | str, sensors: dict[str, int], base: Pa
 
 
 def _read(what: str, path: Path, name: str, shape: tuple[int, int, int], resize: bool, *, raw: bool = False) -> Image:
-    """Read an image; unless ``resize`` is set, check before decoding that it has the size of the film."""
+    """Read an image. Unless ``resize`` is set, its size is compared with the film before it is decoded."""
     (width, height), film = picture_size(path), (shape[1], shape[0])
     if not resize and (width, height) != film:
         raise PathreplayError(

@@ -1,6 +1,6 @@
 """Read a `transforms.json` of NeRF, instant-ngp or Nerfstudio.
 
-Its cameras look along -z with x to the right and y up, and focal lengths are in pixels.
+The cameras of the file look along -z with x to the right and y up. Focal lengths are in pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathreplay.types import Json
 
 MOST_BYTES = 64 * 2**20
 ENDINGS = (".png", ".jpg", ".jpeg", ".exr")
-"""Suffixes to try for images named without one, as in the original NeRF scenes."""
+"""Suffixes to try for images that are named without a suffix, as in the original NeRF scenes."""
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 Row = Annotated[list[Annotated[FiniteFloat, Field(gt=-1e9, lt=1e9)]], Field(min_length=4, max_length=4)]
@@ -31,7 +31,7 @@ Bend = Annotated[FiniteFloat, Field(gt=-1e6, lt=1e6)]
 
 
 class _Intrinsics(BaseModel):
-    """Camera intrinsics; values of a frame override values of the file."""
+    """Camera intrinsics. Values of a frame override values of the file."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -63,7 +63,7 @@ class _Transforms(_Intrinsics):
 
 
 def photos_of_json(path: Path, size_of: Callable[[Path], tuple[int, int]]) -> list[Photo]:
-    """Read the photos of a transforms.json, in its order.
+    """Read the photos of a transforms.json, in the order of the file.
 
     Args:
         path: the file.

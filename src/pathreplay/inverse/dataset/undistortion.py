@@ -1,12 +1,13 @@
 """Undistortion of images with the OpenCV and OpenCV fisheye lens models, by resampling.
 
-In the plane z = 1 in front of the camera, with x to the right, y down and r² = x² + y², the OpenCV model maps (x, y) to
+Let (x, y) be a point of the plane z = 1 in front of the camera, with x to the right, y down and r² = x² + y². The
+OpenCV model maps (x, y) to
 
     x' = x f(r) + 2 p1 x y + p2 (r² + 2 x²)         f = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)
     y' = y f(r) + 2 p2 x y + p1 (r² + 2 y²)
 
-and the fisheye model multiplies both by θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) / r, with θ = arctan r. The pixel is
-(fx x' + cx, fy y' + cy), from the upper left corner of the image.
+The fisheye model multiplies x and y by θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) / r, with θ = arctan r. Both models map
+(x', y') to the pixel coordinates (fx x' + cx, fy y' + cy), measured from the upper left corner of the image.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathreplay.inverse.images.io import Image
 Plane = NDArray[np.float64]
 
 OFF = 0.5
-"""Largest error in pixels at the image border that is accepted for treating pixels as square."""
+"""Error at the image border, in pixels, up to which pixels are treated as square."""
 _STEPS = 2048
 """Number of radii at which the monotonicity of a lens is tested."""
 
@@ -45,7 +46,7 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether images need no resampling: there is no distortion, and pixels are square."""
+        """Whether images need no resampling, because there is no distortion and pixels are square."""
         bends = self.fisheye or any(self.radial) or any(self.tangential)
         return not bends and abs(self.fy / self.fx - 1) * self.h / 2 <= OFF
 

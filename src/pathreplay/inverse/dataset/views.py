@@ -26,9 +26,9 @@ class View:
     weight: Image | None = None
     """Weights of the pixels with mean 1, shape (height, width, 1); None weights all equally."""
     is_test: bool = False
-    """Whether it is a test view, which is not part of the loss."""
+    """Whether this is a test view, which is not part of the loss."""
     share: float = 1.0
-    """Weight of the view in the loss; the mean over the training views is 1."""
+    """Weight of the view in the loss. The weights of the training views have the mean 1."""
 
 
 def sensors_of(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int]:
@@ -39,10 +39,10 @@ def sensors_of(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int
         wanted: ids or indices; None selects all.
 
     Returns:
-        The indices of the sensors by a unique name that is valid as a file name.
+        The index of each sensor, by a unique name that is valid as a file name.
 
     Raises:
-        PathreplayError: a sensor does not exist, or none is selected.
+        PathreplayError: a sensor does not exist, or no sensor is selected.
     """
     available = scene.sensors()
     if not available:
@@ -71,7 +71,7 @@ def _place(item: int | str, ids: list[str], names: list[str]) -> int:
 
 
 def test_views_of(scene: mi.Scene, sensors: dict[str, int], named: Sequence[int | str], shots: list[str]) -> set[str]:
-    """Return the names of the test views: the sensors ``named`` by the job, and those of these ``shots``."""
+    """Return the names of the test views: the sensors ``named`` by the job, and sensors whose id is in ``shots``."""
     available = sensors_of(scene, None)
     ids = [sensor.id() for sensor in scene.sensors()]
     indices = {_place(item, ids, list(available)) for item in named}
@@ -101,7 +101,7 @@ def shares_of(
 
 
 def named_views(scene: mi.Scene, sensors: dict[str, int], wanted: Sequence[int | str], key: str) -> list[str]:
-    """Resolve sensors that a key of the job names. Raises PathreplayError if one is not a view of the job."""
+    """Return the views of sensors that a key of the job names. Raises PathreplayError if a sensor has no view."""
     available, ids = list(sensors_of(scene, None)), [sensor.id() for sensor in scene.sensors()]
     names = {index: name for name, index in sensors.items()}
     indices = [_place(item, ids, available) for item in wanted]

@@ -1,4 +1,4 @@
-"""Background of a view: the environment emitter as its camera sees it without any geometry."""
+"""Background image of a view: the environment emitter as the camera of the view sees it without geometry."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import Image
 
 SAMPLES = 256
-"""Samples per pixel; noise only comes from variation of the environment within a pixel."""
+"""Samples per pixel. The only source of noise is the variation of the environment within a pixel."""
 
 
 def background(scene: mi.Scene, sensor: int) -> Image:
-    """Render the environment of a scene without its geometry; without an environment, the image is black.
+    """Render the environment emitter of a scene without geometry.
 
     Args:
         scene: the scene.
         sensor: index of the sensor.
 
     Returns:
-        The image on the film of the sensor, shape (height, width, channels).
+        The image on the film of the sensor, shape (height, width, channels). It is black if the scene has no
+        environment emitter.
     """
 
     class Sky(mi.SamplingIntegrator):  # defined here, because the base class depends on the variant
@@ -47,7 +48,7 @@ def background(scene: mi.Scene, sensor: int) -> Image:
 
 
 def require_known(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Raise PathreplayError if one of the keys is a parameter of the environment, which then changes during the run."""
+    """Raise PathreplayError if a key belongs to the environment emitter, over which targets are composited."""
     if (environment := scene.environment()) is None:
         return
     parts = {owner[2] for owner in mi.traverse(environment).properties.values()}

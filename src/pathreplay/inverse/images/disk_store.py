@@ -1,6 +1,6 @@
-"""Store for rarely used arrays, such as the images of all views: in memory up to a budget, then on disk.
+"""Store for rarely used arrays, such as images, which are kept in memory up to a budget and then on disk.
 
-Arrays on disk are read-only memory maps of one unnamed temporary file, which is removed with the process.
+Arrays on disk are read-only memory maps of one unnamed temporary file, which is removed when the process ends.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Array = NDArray[np.float32]
 
 
 class DiskStore:
-    """Keeps up to ``room`` bytes of arrays in memory and the others in a file in TMPDIR (default: /var/tmp)."""
+    """Keeps up to ``room`` bytes of arrays in memory, and other arrays in a file in TMPDIR (default: /var/tmp)."""
 
     def __init__(self, room: int = ROOM) -> None:
         self.room = room
@@ -37,7 +37,7 @@ class DiskStore:
 
     @staticmethod
     def of(budget: int | None) -> DiskStore:
-        """Make a store for a run with a memory limit of ``budget`` bytes, of which it uses at most an eighth."""
+        """Make a store that uses at most an eighth of a run's memory limit of ``budget`` bytes (None: no limit)."""
         return DiskStore(ROOM if budget is None else min(ROOM, budget // 8))
 
     def keep(self, array: Array) -> Array:
@@ -67,12 +67,12 @@ class DiskStore:
         return np.frombuffer(pages, array.dtype).reshape(array.shape)
 
     def rest(self) -> None:
-        """Release the memory of the mapped pages; they are read from disk again on the next access."""
+        """Release the memory of the mapped pages, which are read from disk again on the next access."""
         if hasattr(mmap, "MADV_DONTNEED"):
             for pages in self._maps:
                 pages.madvise(mmap.MADV_DONTNEED)
 
 
 def _folder() -> str:
-    """Return the folder of the file; /tmp is a memory file system on some machines, /var/tmp is not."""
+    """Return the folder of the file. /var/tmp is preferred to /tmp, which is in memory on some machines."""
     return os.environ.get("TMPDIR") or ("/var/tmp" if Path("/var/tmp").is_dir() else tempfile.gettempdir())

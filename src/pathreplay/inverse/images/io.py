@@ -1,4 +1,4 @@
-"""Read and write images; in memory, they are always linear radiance.
+"""Read and write images. In memory, images are always linear radiance.
 
 Files with 8 or 16 bits (PNG, JPEG, BMP, TGA, PPM) are decoded from sRGB; EXR, HDR and PFM are linear. PNGs are written
 as sRGB after multiplication by an exposure, EXRs as linear float32.
@@ -87,18 +87,18 @@ def read_image(path: Path, *, raw: bool = False, pixels: int = MOST_PIXELS) -> I
 
 
 def _linear(bitmap: mi.Bitmap) -> Image:
-    """Return the pixels of a bitmap, decoded if they are sRGB."""
+    """Return the linear pixels of a bitmap, after decoding sRGB if necessary."""
     formats = mi.Bitmap.PixelFormat
     if bitmap.pixel_format() in (formats.XYZ, formats.XYZA):
         bitmap = bitmap.convert(pixel_format=formats.RGB if bitmap.channel_count() == 3 else formats.RGBA)
-    # Bitmaps of other types are linear already. Mitsuba's conversion goes by channel names, which may be arbitrary.
+    # Other bitmaps are already linear. Mitsuba's conversion is avoided, because it relies on the names of channels.
     if bitmap.srgb_gamma() or bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16):
         bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
     return np.asarray(bitmap).astype(np.float32, copy=False)
 
 
 def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
-    """Open a file; return its bitmap and a function that orients and scales the decoded pixels."""
+    """Return the bitmap of a file, and a function that orients and scales the decoded pixels."""
     with path.open("rb") as file:
         magic = file.read(2)
         if magic in (b"P5", b"P6"):
@@ -109,7 +109,7 @@ def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
 
 
 def _pixmap(file: BinaryIO, head: PixmapHead) -> mi.Bitmap:
-    """Read a PGM or PPM; Mitsuba's reader supports neither comments nor big-endian 16-bit values."""
+    """Read a PGM or PPM file. Mitsuba's reader supports neither comments nor big-endian 16-bit values."""
     file.seek(head.length)
     stored = np.dtype(">u2" if head.highest > 255 else np.uint8)
     count = head.width * head.height * head.channels
@@ -127,7 +127,7 @@ def _pixmap(file: BinaryIO, head: PixmapHead) -> mi.Bitmap:
 
 
 def _radiance(file: BinaryIO, head: RadianceHead) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
-    """Read a Radiance HDR file; Mitsuba's reader supports neither EXPOSURE nor scanline orders other than -Y +X."""
+    """Read a Radiance HDR file. Mitsuba's reader supports neither EXPOSURE nor scanline orders other than -Y +X."""
     lines, columns = head.counts
     kind = "xyze" if head.xyz else "rgbe"
     file.seek(head.length)
@@ -152,9 +152,9 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def oddities(path: Path) -> list[str]:
-    """List metadata of an image that is ignored, as predicates to follow its name in a message."""
+    """List the metadata of an image that is ignored. Each entry is a predicate for a message about the image."""
     notes = []
-    # Errors are left to `read_image`; Pillow's warnings about large images are irrelevant here.
+    # `read_image` reports errors. Pillow's warnings about large images are irrelevant here.
     with contextlib.suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with PIL.Image.open(path) as picture:
@@ -184,9 +184,9 @@ def with_channels(image: Image, channels: int) -> Image | None:
 
 
 def over_black(image: Image, path: Path) -> Image:
-    """Premultiply the colours of an image file by its alpha, as in rendered images; alpha is kept.
+    """Premultiply the colours of an image file by its alpha, as in rendered images, and keep alpha.
 
-    EXR files store premultiplied colours already; other formats store straight alpha.
+    EXR files already store premultiplied colours. All other formats store straight alpha.
     """
     if image.shape[2] not in (2, 4) or path.suffix.lower() == ".exr":
         return image
@@ -194,14 +194,14 @@ def over_black(image: Image, path: Path) -> Image:
 
 
 def unpremultiplied(image: Image) -> Image:
-    """Divide premultiplied colours by alpha; alpha is kept."""
+    """Divide premultiplied colours by alpha, and keep alpha. Colours become 0 where alpha is 0."""
     alpha = image[:, :, -1:]
     colours = np.divide(image[:, :, :-1], alpha, out=np.zeros_like(image[:, :, :-1]), where=alpha > 0)
     return np.concatenate([colours, alpha], axis=2)
 
 
 def over(image: Image, behind: Image) -> Image:
-    """Composite an image with premultiplied alpha over ``behind``, which has no alpha; the result has none either."""
+    """Composite an image with premultiplied alpha over ``behind``. Neither ``behind`` nor the result has alpha."""
     return image[:, :, :-1] + (1 - image[:, :, -1:]) * behind
 
 
@@ -215,7 +215,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
 
 def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Image:
-    """Resample an image (Lanczos, clamped to its own range); ``crop`` crops the centre to the new aspect first."""
+    """Resample an image (Lanczos, clamped to its range), after a centre crop to the new aspect ratio if ``crop``."""
     if crop:
         h, w = image.shape[:2]
         keep_h, keep_w = min(h, round(w * height / width)), min(w, round(h * width / height))
@@ -230,9 +230,10 @@ def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Ima
 
 
 def exr_bytes(image: Image) -> bytes:
-    """Encode an image as a ZIP-compressed float32 OpenEXR file with channels Y, YA, RGB or RGBA (else 0000, 0001, …).
+    """Encode an image as a ZIP-compressed float32 OpenEXR file.
 
-    Mitsuba's writer is not used, because it waits for its thread pool and deadlocks if that has a single thread.
+    The channels are Y, YA, RGB or RGBA. More than four channels are named 0000, 0001, and so on. Mitsuba's writer is
+    not used, because it waits for its thread pool and deadlocks if the pool has a single thread.
     """
     count = image.shape[2]
     names = {1: ["Y"], 2: ["Y", "A"], 3: ["R", "G", "B"], 4: ["R", "G", "B", "A"]}.get(
@@ -250,14 +251,14 @@ def png_bytes(image: Image, exposure: float = 1.0) -> bytes:
     """Encode an image times ``exposure`` as an 8-bit sRGB PNG file."""
     shown = np.clip((image[:, :, :1] if image.shape[2] == 2 else image) * exposure, 0, 1).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
-    # Written to memory: only run_folder writes files, and it handles a full disk.
+    # Encode in memory, because only `run_folder` writes files; that module handles a full disk.
     stream = mi.MemoryStream()
     bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(stream, mi.Bitmap.FileFormat.PNG)
     return bytes(stream.raw_buffer())
 
 
 def encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Encode linear radiance as sRGB, both in [0, 1]."""
+    """Encode linear radiance in [0, 1] as sRGB values in [0, 1]."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
 
 

@@ -8,14 +8,14 @@ from pathreplay.inverse.config.schema import BATCH
 
 
 def batch(views: list[int], size: int | None, seed: int, iteration: int) -> list[int]:
-    """Return those of the training ``views`` that an iteration evaluates, in this order.
+    """Return the training ``views`` that an iteration evaluates, in the order of evaluation.
 
-    An epoch contains every training view once; its last batch may be smaller. The batch depends only on the seed and
-    the iteration, so a resumed run continues with the same views.
+    An epoch contains every training view once. The last batch of an epoch may be smaller than ``size``. A batch depends
+    only on the seed and the iteration, so a resumed run continues with the same views.
     """
     n = len(views)
     if size is None or size >= n:
-        return views[::-1]  # the order of earlier versions, which affects the baselines of media
+        return views[::-1]  # reversed as in earlier versions, since the order affects the baselines of media
     number, k = divmod(iteration, -(-n // size))
     return [views[i] for i in _shuffled(seed, number, n)[k * size : (k + 1) * size]]
 

@@ -1,4 +1,4 @@
-"""The state of a run, and its checkpoints: sealed safetensors files from which it resumes exactly."""
+"""State of a run, and its checkpoints: safetensors files with a checksum, from which a run resumes exactly."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class Entry:
     dropped: NonNegativeInt = 0
     """Number of gradient entries of single views that were NaN or infinite and counted as zero."""
     errors: dict[str, float] = field(default_factory=dict)
-    """Root mean square errors after the step of variables with known truth, and errors of poses (`PoseError.of`)."""
+    """Errors after the step: RMS errors of variables with a known true value, and errors of poses (`PoseError.of`)."""
     picture_error: float | None = None
-    """Root mean square error of the images without their noise, in iterations that measure it (with a baseline)."""
+    """RMS error of the images without rendering noise, measured in some iterations of runs with a baseline."""
     penalty: FiniteFloat = 0.0
     """Sum of all regularizers."""
     spp: NonNegativeInt = 0
@@ -52,7 +52,7 @@ class Entry:
     slopes: dict[str, list[float]] = field(default_factory=dict)
     """Sums of each gradient over parts of its variable (see `movement`)."""
     means: dict[str, list[float]] = field(default_factory=dict)
-    """Means of the values over the same parts, after the step."""
+    """Means of the values over parts of each variable, after the step (see `movement`)."""
 
 
 @dataclass
@@ -64,10 +64,10 @@ class Run:
     values: dict[str, Array]
     """Decoded values of the variables, by key."""
     learned: Arrays = field(default_factory=dict)
-    """Statistics that evaluations pass on to later ones (baselines of media), by name."""
+    """Statistics that evaluations pass on to later evaluations, such as the learned baselines of media, by name."""
     history: list[Entry] = field(default_factory=list)
     baseline: Run | None = None
-    """A run of another integrator from the same initial values and in the same time."""
+    """A run of another integrator for comparison, with the same initial values and the same computation time."""
     whole: bool = True
     """False during a step, when the state is inconsistent and cannot be saved."""
 
@@ -86,7 +86,7 @@ _VALUE, _LEARNED = "value:", "learned:"
 
 
 def save(run: Run) -> Content:
-    """Serialise a run as a sealed file, whose content is generated while it is written."""
+    """Serialise a run as a file with a checksum. The content is generated while the file is written."""
     state = run.optimiser.state()
     plain: dict[str, Array] = {
         **{_LEARNED + name: value for name, value in run.learned.items()},
@@ -103,7 +103,7 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Col
     Args:
         path: the checkpoint.
         run: a new run of the same job, which is changed in place.
-        levels: refinement schedules of the variables, by key; None for variables without one.
+        levels: refinement schedules of the variables, by key; None for variables that are not refined.
         held: keys of variables that are frozen in some stages.
 
     Raises:
@@ -125,7 +125,7 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Col
 def _read(
     path: Path, values: Arrays, levels: Mapping[str, Levels | None], held: Collection[str]
 ) -> tuple[dict[str, Array], State, list[Entry], Arrays]:
-    """Read values, optimiser state, history and learned statistics; `restore` translates the errors it raises."""
+    """Read values, optimiser state, history and learned statistics. `restore` translates the errors raised here."""
     if not path.is_file():
         raise ValueError("no such file")
     with safetensors.safe_open(str(path), framework="numpy") as file:

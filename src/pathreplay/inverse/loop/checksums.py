@@ -18,10 +18,10 @@ from pathreplay.platform.files import file_problem
 from pathreplay.platform.tensor_files import safetensors_chunks
 
 SUMS = "checksums.json"
-"""File with the size and checksum of each initial and target image in a run folder, by name."""
+"""Name of the file that lists the sizes and checksums of the initial and target images in a run folder."""
 
 SEAL = "sha256"
-"""Name of the last tensor of a sealed file, which is the checksum of all preceding bytes."""
+"""Name of the last tensor of a sealed file. This tensor contains the checksum of all preceding bytes."""
 
 _SEAL_BYTES = hashlib.sha256().digest_size
 _AT_ONCE, _MOST_BYTES = 2**20, 64 * 2**20
@@ -42,7 +42,7 @@ _TABLE = TypeAdapter(dict[str, _Sum])
 
 
 def sealed_chunks(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Iterator[Chunk]:
-    """Yield the chunks of a safetensors file of the arrays, followed by its `SEAL`."""
+    """Yield the chunks of a safetensors file of the arrays, followed by its checksum (`SEAL`)."""
     digest = hashlib.sha256()
     for chunk in safetensors_chunks(arrays, metadata, {SEAL: _SEAL_BYTES}):
         digest.update(chunk)
@@ -61,7 +61,7 @@ def require_seal(path: Path) -> None:
 
 
 def with_sums(files: Mapping[str, Content]) -> dict[str, Content]:
-    """Append the file `SUMS` to files by name; its content is generated after the others have been written."""
+    """Add the file `SUMS` to files by name. Its content is generated after the other files have been written."""
     sums: dict[str, _Sum] = {}
 
     def summed(name: str, content: Content) -> Iterator[Chunk]:

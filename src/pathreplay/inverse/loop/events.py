@@ -9,7 +9,7 @@ from pathreplay.inverse.loop.checkpoint import Entry
 
 @dataclass(frozen=True)
 class Started:
-    """Iterations begin, after ``done`` earlier ones, of ``wanted`` in total."""
+    """Iterations begin or resume. ``done`` of the ``wanted`` iterations have already been taken."""
 
     done: int
     wanted: int
@@ -32,7 +32,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Entered:
-    """Stage ``number`` (from 1) of ``of`` begins or is resumed."""
+    """Stage ``number`` of ``of`` stages, counted from 1, begins or is resumed."""
 
     number: int
     of: int
@@ -67,7 +67,7 @@ class Stepped:
 
 @dataclass(frozen=True)
 class Stopped:
-    """Iterations end after ``done`` in total."""
+    """Iterations have ended, after ``done`` iterations in total."""
 
     done: int
 
@@ -97,13 +97,13 @@ def note_of(event: Told) -> str:
 
 
 class Notes:
-    """Log lines of events; recurring events are reported once per parameter."""
+    """Log lines of events. Recurring events are reported once per parameter."""
 
     def __init__(self) -> None:
         self._told: set[tuple[type, str]] = set()
 
     def of(self, event: Event) -> str:
-        """Return the line of an event; "" if it has none, or was reported before."""
+        """Return the log line of an event, or "" if the event has no line or was reported before."""
         if isinstance(event, (Started, Stepped, Stopped)):
             return ""
         if isinstance(event, (NonFinite, LowSNR)):

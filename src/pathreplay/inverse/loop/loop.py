@@ -1,4 +1,4 @@
-"""The optimisation loop: evaluate, step, project; interruptible and resumable."""
+"""The optimisation loop, which evaluates, steps and projects variables. Runs can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, s
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
 
-# Number of evaluations of the image error in a job with a baseline, which take some per cent of its time.
+# Number of measurements of the image error in a job with a baseline. They take a few per cent of the job's time.
 JUDGEMENTS = 10
 
-# Fraction of non-finite gradient entries above which an iteration counts towards `max_consecutive_nonfinite`.
+# Smallest fraction of non-finite gradient entries for which an iteration counts towards `max_consecutive_nonfinite`.
 HALF = 0.5
 
 
@@ -76,7 +76,7 @@ def new_run(
         record: whether the default evaluator records its passes as frozen functions.
         optimizer: type and options of the optimiser; default: Adam.
         evaluate: evaluation of shards in this process; default: an `Evaluator`.
-        executor: evaluates the shards instead, e.g. in other processes.
+        executor: executor of the shards, e.g. in other processes; default: ``evaluate`` in this process.
     """
     values = {
         v.key: np.array(v.start, np.float32) if dr.is_tensor_v(v.like) else get_array(to_value(v.like, v.start))
@@ -100,7 +100,7 @@ def optimiser_of(problem: Problem, values: Arrays, options: Optimizer, search: S
 
 
 def best_values(problem: Problem, run: Run) -> dict[str, Array]:
-    """Return the resulting values of a run: after its last step, or at the best evaluation of a line search."""
+    """Return the resulting values of a run: the values after its last step, or the best values of a line search."""
     best = run.optimiser.answer()
     for v in problem.variables:
         if v.coordinates and v.key in best:
@@ -112,14 +112,14 @@ def best_values(problem: Problem, run: Run) -> dict[str, Array]:
 def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
     """Take steps from ``len(run.history)`` to ``iterations``, and yield the events of the run.
 
-    After each step, the run's baseline takes steps until it has used as much time. Alternating the two gives them equal
-    conditions on a machine whose load varies. The baseline uses the learning rate and resolutions of the iteration of
-    the main run.
+    After each step of the run, its baseline takes steps until the baseline has used as much time as the run. On a
+    machine whose load varies, this alternation gives the run and the baseline equal conditions. The steps of the
+    baseline use the learning rate and the resolutions of the run's current iteration.
 
     Args:
         problem: the problem.
         run: the run, which is changed in place.
-        stop: request to stop, which is checked after each step.
+        stop: request to stop the run, which is checked after each step.
 
     Raises:
         PathreplayError: the loss or a value is not finite, or gradients were not finite in
@@ -157,7 +157,7 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
 
 
 def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
-    """Yield the events of `iterate`; `Problem.computing` applies while steps are taken, not to observers."""
+    """Yield the events of `iterate`. Its steps run inside `Problem.computing`, and observers of events outside."""
     events = iterate(problem, run, stop)
     while True:
         with problem.computing():
@@ -168,7 +168,7 @@ def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
 
 
 def require_gradients(problem: Problem, run: Run) -> None:
-    """Raise PathreplayError after `max_consecutive_nonfinite` iterations in which half of a gradient is not finite."""
+    """Raise PathreplayError after `max_consecutive_nonfinite` iterations in which half of a gradient was not finite."""
     most = problem.config.max_consecutive_nonfinite
     last = run.history[-most:]
     if len(last) < most:
@@ -186,8 +186,8 @@ def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
     """Take one step and append it to the history of the run.
 
     First, refine the grids whose next resolution is due, which resets their optimiser state. Then evaluate the views of
-    the `batch`, with separate seeds for each view (and each part of it, see `Config.parts`), and sum the results in a
-    fixed order. Finally, step with the learning rate of the iteration (see `schedules`) and project all variables onto
+    the `batch` and sum the results in a fixed order. Each view, or each part of its samples (see `Config.parts`), has
+    its own seed. Finally, step with the learning rate of the iteration (see `schedules`) and project all variables onto
     their bounds.
 
     The integrator determines which derivatives the gradient contains. Targets, bounds and random numbers are not
@@ -255,7 +255,7 @@ def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
 
 
 def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array], list[Event]]:
-    """Resample grids whose next resolution is due, unless they are frozen; returns all values, and the events."""
+    """Resample grids that are due for refinement and not frozen. Returns all values, and an event per such grid."""
     moving = [v for v in part.problem.variables if v.key in part.moving]
     due = {v.key: v.levels.shape_at(position) for v in moving if v.levels}
     due = {key: shape for key, shape in due.items() if values[key].shape != shape}
@@ -264,7 +264,7 @@ def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array
 
 
 def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
-    """Make the shards of an iteration: one per view, or several per view (see `Config.parts`)."""
+    """Make the shards of an iteration, with `Config.parts` shards per view."""
     config, views = part.problem.config, part.problem.views
     same = 0 if config.optimizer.searches else iteration
     return [
@@ -287,9 +287,10 @@ def _seen(evaluations: Iterable[Evaluation], dropped: list[dict[str, int]]) -> I
 
 
 def _summed(evaluations: Iterator[Evaluation], scale: float, halves: bool) -> tuple[Evaluation, dict[str, float]]:
-    """Sum evaluations and multiply by ``scale``; with alternating ``halves``, return the noise norm of each gradient.
+    """Sum evaluations, multiply the sum by ``scale``, and compute the noise norm of each gradient if ``halves`` is set.
 
-    The noise norm is |a - b| times ``scale``, where a and b are the sums over the two halves.
+    With ``halves``, the evaluations belong alternately to two halves of the samples. The noise norm of a gradient is
+    |a - b| times ``scale``, where a and b are the sums over the halves.
     """
     if not halves:
         return total(evaluations, scale, owned=True), {}
@@ -316,7 +317,7 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
     stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates, loss)
     stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
-        if not np.isfinite(value.sum(dtype=np.float64)):  # finite if and only if all entries are
+        if not np.isfinite(value.sum(dtype=np.float64)):  # a sum is finite if and only if all entries are
             raise PathreplayError(
                 f"'{key}' is not finite after iteration {len(run.history)}; lower its learning rate, or bound it"
             )
@@ -327,7 +328,7 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
 
 
 def render_views(problem: Problem, values: Arrays) -> dict[str, Image]:
-    """Render all views with the job's integrator at these values; all calls use the same random numbers."""
+    """Render all views with the job's integrator at these values. All calls use the same random numbers."""
     return {view.name: problem.disk.keep(picture_of(problem, values, view)) for view in problem.views}
 
 
@@ -345,7 +346,7 @@ def _plain(problem: Problem, view: View, spp: int) -> Image:
 
 
 def ended(problem: Problem, run: Run) -> Run:
-    """Return the run, and its baseline, with their resulting values, including exposures of test views."""
+    """Return the run with its resulting values and exposures of test views. The baseline is changed in place."""
     run = replace(run, values=best_values(problem, run))
     for each in filter(None, (run, run.baseline)):
         each.values = dict(with_exposures(problem, each.values))
@@ -353,7 +354,7 @@ def ended(problem: Problem, run: Run) -> Run:
 
 
 def with_exposures(problem: Problem, values: Arrays) -> Arrays:
-    """Return the values with the exposures of test views, which the run does not optimise, fitted to their targets."""
+    """Return the values with exposures of test views, which the run does not optimise, fitted to their targets."""
     if EXPOSURE not in values or not any(view.is_test for view in problem.views):
         return values
     put_values(problem, values)
@@ -366,11 +367,11 @@ def with_exposures(problem: Problem, values: Arrays) -> Arrays:
 
 
 def judged(problem: Problem, values: Arrays, iteration: int) -> float:
-    """Estimate the root mean square error of the training views without the noise of rendering them.
+    """Estimate the root mean square error of the training views without rendering noise.
 
-    With two independent renderings A and B of an image I, E[(A - T)(B - T)] = (I - T)², whereas the square of one
-    rendering would add its variance. The root is taken of the mean over pixels and views; a negative mean counts as
-    zero. The noise of the targets T is included.
+    Two independent renderings A and B of an image I satisfy E[(A - T)(B - T)] = (I - T)², whereas E[(A - T)²] would
+    include the variance of A. The result is the square root of the mean over pixels and views, or 0 if the mean is
+    negative. It includes the noise of the targets T.
 
     Args:
         problem: the problem.

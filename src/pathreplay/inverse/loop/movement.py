@@ -1,9 +1,11 @@
-"""Convergence test: whether the mean of the last gradients of a variable differs from zero beyond its noise.
+"""Convergence test: whether the mean of the last gradients of a variable differs significantly from zero.
 
-The noise of gradients is independent between iterations, so the standard error of their mean over a window of n
-iterations is their standard deviation over √n. At convergence the expected gradient is zero; before, it is not, however
-small the steps are. A gradient that is small relative to the initial one also counts as converged: near a minimum the
-loss is quadratic, so the remaining distance is proportional to the gradient.
+The noise of gradients is independent between iterations. The standard error of the mean gradient over a window of n
+iterations is therefore the standard deviation of the gradients divided by √n. The expected gradient is zero at
+convergence, and nonzero before, however small the steps are.
+
+A variable also counts as converged if its gradient is small relative to the initial gradient. Near a minimum, the loss
+is quadratic, so the remaining distance is proportional to the gradient.
 """
 
 from __future__ import annotations
@@ -26,9 +28,9 @@ _FIRST = 5
 
 
 def parts_of(array: Array, mean: bool = False) -> list[float]:
-    """Sum an array over up to `MOST_PARTS` contiguous parts, or average it if ``mean``.
+    """Sum an array over up to `MOST_PARTS` contiguous parts, or average it over these parts if ``mean`` is set.
 
-    In a sum, independent noise of the entries averages out and a common signal adds up. Results are rounded to six
+    In a sum, independent noise of the entries averages out, and a common signal adds up. Results are rounded to six
     digits to keep checkpoints small.
     """
     flat = np.ravel(array)
@@ -40,16 +42,17 @@ def parts_of(array: Array, mean: bool = False) -> list[float]:
 
 
 def window_of(history: Sequence[Entry], begin: int = 0) -> Sequence[Entry]:
-    """Return the last third of the iterations since ``begin``, at least `SHORTEST`; empty if there are fewer."""
+    """Return the last third of the iterations since ``begin``, at least `SHORTEST`, or none if there are fewer."""
     count = len(history) - begin
     return history[-max(count // 3, SHORTEST) :] if count >= SHORTEST else ()
 
 
 def still_moves(history: Sequence[Entry], key: str, begin: int = 0) -> bool | None:
-    """Test whether a variable still moves; returns None if there are too few iterations since ``begin``.
+    """Test whether a variable still moves. Returns None if there are too few iterations since ``begin``.
 
-    For the gradient sum g of each part, t = √n mean(g) / std(g) over the window of n iterations. If there is only
-    noise, the mean of t² over m parts is about 1 ± √(2/m). Constant parts, e.g. at a bound, are excluded.
+    Let g be the sum of the gradient over a part of the variable. The test statistic of the part is
+    t = √n mean(g) / std(g) over a window of n iterations. If gradients are pure noise, the mean of t² over m parts is
+    about 1 ± √(2/m). Parts that stay constant, e.g. at a bound, are excluded.
     """
     window = [entry for entry in window_of(history, begin) if key in entry.slopes]
     first = [entry for entry in history[begin:] if key in entry.slopes][:_FIRST]

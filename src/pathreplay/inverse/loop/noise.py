@@ -1,8 +1,9 @@
-"""Signal-to-noise ratio of gradients, and the adaptation of samples per pixel to it.
+"""Signal-to-noise ratio of gradients, and the adaptation of samples per pixel to this ratio.
 
-Let a and b be gradients from two independent halves of the samples. The optimiser steps by the mean G = (a + b)/2, and
-n = |a - b|/2 estimates the norm of its noise: E[n²] = E|G - E G|², hence E[|G|² - n²] = |E G|². A single iteration says
-little (a scalar parameter has one degree of freedom), so the estimates are summed over a window of iterations.
+Let a and b be gradients from two independent halves of the samples. The optimiser uses the mean G = (a + b)/2. The norm
+of the noise of G is estimated by n = |a - b|/2, because E[n²] = E|G - E G|². The squared signal follows from
+E[|G|² - n²] = |E G|². Estimates from a single iteration are imprecise, in particular for scalar parameters with their
+single degree of freedom. The estimates are therefore summed over a window of iterations.
 """
 
 from __future__ import annotations
@@ -14,16 +15,16 @@ from pathreplay.inverse.config.noise_options import AdaptiveSpp
 from pathreplay.inverse.loop.checkpoint import Entry
 
 WINDOW = 16
-"""Number of iterations in the window; the ratio of a scalar parameter is then known to about 20 %."""
+"""Number of iterations in the window. For a scalar parameter, the error of the ratio is then about 20 %."""
 
 FAINT = 0.1
-"""Ratio below which a parameter is reported; about a hundred steps must be averaged to reach a ratio of 1."""
+"""Ratio below which a parameter is reported. About a hundred such gradients must be averaged to reach a ratio of 1."""
 
 
 def ratios(history: Sequence[Entry]) -> dict[str, float]:
-    """Compute √(Σ (|G|² - n²) / Σ n²) over the last `WINDOW` iterations, by variable.
+    """Compute the signal-to-noise ratio √(Σ (|G|² - n²) / Σ n²) over the last `WINDOW` iterations, by variable.
 
-    The result is empty unless all of these iterations exist and have equal numbers of samples.
+    The result is empty if there are fewer iterations, or if their numbers of samples per pixel differ.
     """
     last = history[-WINDOW:]
     if len(last) < WINDOW or len({entry.spp for entry in last}) > 1:
@@ -42,8 +43,9 @@ def ratios(history: Sequence[Entry]) -> dict[str, float]:
 def next_spp(auto: AdaptiveSpp, history: Sequence[Entry]) -> int:
     """Return the samples per pixel of the next iteration, which depend on the history alone.
 
-    After every `WINDOW` iterations with equal samples, the number is doubled if a variable is below the target ratio,
-    and halved if all are above twice the target (halving the samples at most halves the ratio).
+    The number changes only after multiples of `WINDOW` iterations with equal samples. It is doubled if the ratio of any
+    variable is below the target. It is halved if all ratios are above twice the target, because halving the samples at
+    most halves the ratios.
     """
     if not history:
         return auto.min

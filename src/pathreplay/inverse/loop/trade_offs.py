@@ -1,10 +1,12 @@
 """Identifiability: parameters that do not affect the images, and pairs of parameters whose effects cancel.
 
-The columns of the Jacobian J of all images with respect to some entries of each parameter are central differences with
-common random numbers. Equivalent changes (moving a camera, or moving everything else the opposite way) therefore have
-equal columns, including the noise. The test computes the smallest principal angle between the column spaces of two
-parameters. If it is zero, a change of one parameter can be undone by a change of the other, and the images determine
-only their combined effect. The radiance of an emitter and the reflectance of the surface that it lights are an example.
+The Jacobian J of all images with respect to some entries of each parameter is computed by central differences with
+common random numbers. Equivalent changes therefore have equal columns in J, including the noise. For example, moving a
+camera is equivalent to moving everything else in the opposite direction.
+
+The test computes the smallest principal angle between the column spaces of two parameters. If the angle is zero, a
+change of one parameter can be undone by a change of the other parameter, and the images determine only the combined
+effect. An example is the radiance of an emitter and the reflectance of the surface that the emitter lights.
 """
 
 from __future__ import annotations
@@ -23,15 +25,16 @@ from pathreplay.inverse.parameters.variables import Variable
 from pathreplay.inverse.problem.problem import Problem
 
 FEW = 4
-"""Largest size of a variable whose entries are perturbed one by one; larger ones are scaled as a whole."""
+"""Maximum number of entries of a variable that are perturbed one by one. Larger variables are scaled as a whole."""
 MOST_COLUMNS, MOST_PIXELS, MOST_ROWS = 16, 2**23, 2**20
-"""Largest number of columns, of pixels of all views, and of rows that are compared (evenly subsampled)."""
+"""Maximum number of columns of J, of pixels of all views, and of rows of J. More rows are subsampled evenly."""
 MOST_SAMPLES, FREE_SAMPLES, SHARE = 16, 2**22, 0.1
-"""Most samples per pixel; budget of samples in total, or as a fraction of the samples of the run if that is more."""
+"""Maximum number of samples per pixel, and budget of samples in total. The budget is `FREE_SAMPLES`, or the fraction
+`SHARE` of the run's samples if that is more."""
 STEP = 0.01
 """Size of a perturbation, as a fraction of the sum of value, change during the run and learning rate."""
 UNDONE = 0.05
-"""Sine of the angle below which two parameters are a trade-off: the fraction of a change that cannot be undone."""
+"""Sine of the angle below which two parameters are a trade-off. This fraction of a change cannot be undone."""
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Columns of the Jacobian by variable, shape (pixels, entries)."""
@@ -49,16 +52,16 @@ def trade_offs(columns: Columns) -> tuple[tuple[str, str], ...]:
 
 
 def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Columns, tuple[str, ...]]:
-    """Compute the columns of the Jacobian, without exposures.
+    """Compute the columns of the Jacobian for all variables except exposures.
 
     Args:
         problem: the problem.
         values: values of the variables.
-        taken: number of samples that the run has used, which bounds the cost.
+        taken: number of samples that the run has used, which determines the budget of samples (see `SHARE`).
 
     Returns:
         The columns by variable, and the variables that do not affect the images. Both are empty if there are too many
-        variables, they are too large, or rendering all views would be too expensive.
+        variables, if a variable is too large, or if rendering all views would be too expensive.
     """
     variables = [v for v in problem.variables if v.key != EXPOSURE]
     if any(values[v.key].size >= LARGE for v in variables) or len(variables) > MOST_COLUMNS:
@@ -89,7 +92,7 @@ def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Colu
 
 
 def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
-    """Render all training views with common random numbers; returns their weighted pixels in one vector."""
+    """Render all training views with common random numbers. Returns the weighted pixels of all views in one vector."""
     pictures = []
     for view in problem.trained().values():
         picture = picture_of(problem, values, view, spp)
@@ -98,7 +101,7 @@ def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
 
 
 def _changes(variable: Variable, value: Array, few: int = FEW) -> list[Array]:
-    """Make small perturbations of a value: of each entry, or of all entries in proportion."""
+    """Make small perturbations of a value: one per entry, or one that scales a value with more than ``few`` entries."""
     size = STEP * variable.learning_rate
     if value.size <= few:
         size += STEP * (_length(value) + _length(value - variable.start))

@@ -1,4 +1,4 @@
-"""Assessment of the values at the end of a run: still moving, converged, or not determined by the images."""
+"""Assessment of a run: which variables still move, have converged, or are not determined by the images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pathreplay.inverse.problem.problem import Problem
 
 @dataclass(frozen=True)
 class Verdict:
-    """Keys of variables by their state; variables in no group had too few iterations for a test."""
+    """Keys of variables, grouped by state. Variables in none of the groups had too few iterations for a test."""
 
     moving: tuple[str, ...] = ()
     """Variables that still move."""
@@ -54,7 +54,7 @@ def _listed(keys: Sequence[str]) -> str:
 
 
 def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
-    """Assess a run. Trade-offs need renderings, so they are not computed for a run that was ``stopped`` early."""
+    """Assess a run. If it was ``stopped`` early, trade-offs are not computed, because they need renderings."""
     moves = {v.key: still_moves(run.history, v.key, _begin(problem, v.key, run)) for v in problem.variables}
     known = [key for key, moving in moves.items() if moving is not None]
     done = bool(run.optimiser.finished)
@@ -71,13 +71,13 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     except (PathreplayError, RuntimeError, ValueError, np.linalg.LinAlgError):
         # User functions or Mitsuba may reject perturbed values; the run itself has succeeded.
         return Verdict(moving, arrived)
-    # With few samples, a perturbation may not move a silhouette across any of them, but its gradient is not zero.
+    # A perturbation may be too small to move a silhouette across any sample, although the gradient is not zero.
     pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
     return Verdict(moving, arrived, pairs, tuple(key for key in unseen if key not in pulled))
 
 
 def _begin(problem: Problem, key: str, run: Run) -> int:
-    """Return the first iteration of the current stage or resolution of a variable, whichever is later."""
+    """Return the first iteration of the current stage or resolution of a variable, whichever began later."""
     stages = begins(problem.config.stages or [])[:-1]
     levels = next(v.levels for v in problem.variables if v.key == key)
     return max(at for at in (0, *stages, *(levels.begins if levels else ())) if at <= len(run.history))

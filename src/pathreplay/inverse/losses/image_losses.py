@@ -1,6 +1,6 @@
 """Losses that couple pixels: scale-invariant, SSIM and LPIPS.
 
-Rendering noise biases their gradients; more samples per pixel reduce the bias.
+Rendering noise biases the gradients of these losses. More samples per pixel reduce the bias.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from pathreplay.scenes.descriptions import one_line
 if TYPE_CHECKING:
     import torch
 
-# An image with less than this fraction of the target's mean square counts as black: its scale factor tends to 0.
+# Fraction of the target's mean square. The scale factor tends to 0 for images whose mean square is smaller.
 _BLACK = 1e-9
 
 
 def scale_invariant(image: mi.TensorXf, target: mi.TensorXf, weight: mi.TensorXf | None = None) -> mi.TensorXf:
     """Compute (s I - T)² with the least-squares scale s = Σ w I T / Σ w I² of the whole image.
 
-    The scale s is detached: at the minimum, the derivative of the loss by s is zero. For a black image, s is 0.
+    The scale s is detached, because it minimises the loss: the derivative of the loss with respect to s is zero. For a
+    black image, s is 0.
 
     Args:
         image: rendered image I, shape (height, width, channels).
@@ -58,7 +59,7 @@ def _encoded(image: mi.TensorXf) -> mi.TensorXf:
 
 
 def _blurred(image: mi.TensorXf) -> mi.TensorXf:
-    """Convolve with the Gaussian window of SSIM; images are mirrored at their borders."""
+    """Convolve an image with the Gaussian window of SSIM. The image is mirrored at its borders."""
     offsets = np.arange(-CUT, CUT + 1)
     window = np.exp(-0.5 * (offsets / SIGMA) ** 2)
     window /= window.sum()
@@ -78,7 +79,7 @@ def _blurred(image: mi.TensorXf) -> mi.TensorXf:
 
 
 def lpips(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Compute the perceptual distance LPIPS (Zhang et al. 2018) by the package ``lpips``, on sRGB-encoded colours.
+    """Compute the perceptual distance LPIPS (Zhang et al. 2018) with the package ``lpips`` on sRGB-encoded colours.
 
     Args:
         image: rendered image, shape (height, width, 3).
@@ -89,7 +90,7 @@ def lpips(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
     Raises:
         PathreplayError: the package is not installed, its weights cannot be loaded, the images do not have three
-            channels, or they are too small for the network.
+            channels, or the images are too small for the network.
     """
     if image.shape[2] != 3:
         raise PathreplayError(

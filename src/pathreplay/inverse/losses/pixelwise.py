@@ -1,10 +1,12 @@
 """Per-pixel losses, and the lookup of losses by name.
 
-A loss f(I, T) compares the rendered image I (noisy, differentiable) with the target T; the optimiser minimises its
-(weighted) mean over pixels and channels. The image and its derivative use independent samples (see `frozen`), so the
-gradient is unbiased if f' is linear in I, as for ``l2`` and ``relative-l2``. Noise in I biases the gradients of the
-other losses, less so with more samples; they are useful where outliers would dominate ``l2``. Losses that couple pixels
-are in `image_losses`.
+A loss f(I, T) compares the rendered image I with the target T. The optimiser minimises the weighted mean of f over
+pixels and channels.
+
+The derivative f' is evaluated at an image that is independent of the samples of the derivative of I (see `frozen`). The
+gradient is therefore unbiased if f' is linear in I, as for ``l2`` and ``relative-l2``. Noise in I biases the gradients
+of the other losses, and more samples per pixel reduce the bias. These losses are useful where outliers would dominate
+``l2``. Losses that couple pixels are in `image_losses`.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ def l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 def l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Compute (I - T)². The gradient is unbiased; the expected value includes the variance of I."""
+    """Compute (I - T)². The gradient is unbiased. The expected value includes the variance of I."""
     return dr.square(image - target)
 
 
@@ -103,7 +105,7 @@ def mean_loss(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weight: mi.Te
 def find_loss(name: str, modules: Modules | None = None) -> Loss:
     """Return a loss by its name, or import ``module:function`` through ``modules`` (default: installed modules).
 
-    Raises PathreplayError for an unknown name, with the nearest one, or if the import fails.
+    Raises PathreplayError if the import fails, or if the name is unknown; the message then suggests the nearest name.
     """
     if name in LOSSES:
         return LOSSES[name]
@@ -120,7 +122,10 @@ def _imported(name: str, modules: Modules) -> Loss:
 
 @dataclass(frozen=True)
 class Own:
-    """A user loss. Raises PathreplayError if it fails, or returns neither a tensor like the image nor a scalar."""
+    """A loss that is a user function.
+
+    Raises PathreplayError if the function fails, or returns neither a scalar nor a tensor in the shape of the image.
+    """
 
     function: Imported
 

@@ -1,4 +1,4 @@
-"""Evaluates loss and gradient of a problem: shards of an iteration, the evaluator of a scene, and executors."""
+"""Evaluation of loss and gradient: shards of an iteration, the evaluator of a scene, and executors."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from pathreplay.platform import memory
 from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
-"""Number of entries of a variable from which its memory is managed explicitly."""
+"""Number of entries from which the memory of a variable is managed explicitly (see `release`)."""
 MOST_SENSORS = 64
-"""Maximum number of sensors of a scene whose passes are recorded. The recording of each view holds all sensors, so that
-memory grows with the square of their number (measured: 3 MB per view with 50 sensors, 11 MB with 200)."""
+"""Maximum number of sensors of a scene whose passes are recorded. The recording of each view contains all sensors, so
+memory grows with the square of the number of sensors (measured: 3 MB per view with 50 sensors, 11 MB with 200)."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +55,15 @@ class Shard:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Contribution of a shard to the loss (the mean over training views) and to its gradients, by key.
+    """Contribution of a shard to the loss, which is the mean over the training views, and to its gradients by key.
 
-    Gradients are unbiased for the losses in `QUADRATIC`. The loss itself includes the variance of the images.
+    Gradients are unbiased for the losses in `QUADRATIC`. The expected loss includes the variance of the images.
     """
 
     loss: float
     gradients: dict[str, Array]
     dropped: dict[str, int]
-    """Number of gradient entries by key that were NaN or infinite in a view, and were replaced by zero."""
+    """Number of gradient entries that were NaN or infinite in a view and were replaced by zero, by key."""
     learned: Arrays
     """State of the integrator after the shard."""
 
@@ -71,12 +71,12 @@ class Evaluation:
 Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]
 """evaluate(values, shard, learned): a pure function, up to rounding in sums over threads.
 
-``values`` are the decoded values of all variables, and ``learned`` is the integrator's state after earlier evaluations.
+``values`` are the decoded values of all variables. ``learned`` is the integrator's state after earlier evaluations.
 """
 
 
 class Total:
-    """Running sum of evaluations; keeps no summand."""
+    """Running sum of evaluations, whose summands can be freed after they have been added."""
 
     def __init__(self, owned: bool = False) -> None:
         self._owned, self._count, self._loss = owned, 0, 0.0
@@ -98,14 +98,14 @@ class Total:
         self._count += 1
 
     def _room(self, key: str) -> Array | None:
-        """Return a writable array for the sum: arrays from another process are read-only."""
+        """Return the array of a sum if it may be overwritten, or None. Arrays from other processes are read-only."""
         here = self._sums[key]
         return here if self._owned and here.flags.writeable else None
 
     def of(self, share: float = 1.0) -> Evaluation:
-        """Return the sum times ``share``. The learned state is the mean of the evaluations' states.
+        """Return the sum of losses and gradients, times ``share``, and the mean of the learned states.
 
-        All evaluations of an iteration start from the same state, so they can run concurrently.
+        All evaluations of an iteration start from the same learned state, so they can run concurrently.
         """
         sums, known = self._sums, self._known
         if share != 1:
@@ -116,7 +116,7 @@ class Total:
 
 
 def total(evaluations: Iterable[Evaluation], share: float = 1.0, owned: bool = False) -> Evaluation:
-    """Sum evaluations in the given order, and multiply by ``share``: see `Total`."""
+    """Sum evaluations in the given order, and multiply the sum by ``share`` (see `Total`)."""
     found = Total(owned)
     for each in evaluations:
         found.add(each)
@@ -127,12 +127,12 @@ def total(evaluations: Iterable[Evaluation], share: float = 1.0, owned: bool = F
 class Executor(Protocol):
     """Evaluates the shards of an iteration, and yields results in the order of the shards.
 
-    The caller drops each result before it requests the next one. Memory therefore holds one gradient and the sum,
-    for any number of shards.
+    The caller drops each result before it requests the next result. Memory therefore contains only one gradient and the
+    sum, for any number of shards.
     """
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
-        """Yield one evaluation per shard, in order; each starts from the same state ``learned``."""
+        """Yield one evaluation per shard, in order. All evaluations start from the same state ``learned``."""
 
 
 class Local:
@@ -148,21 +148,21 @@ class Local:
 
 
 def _taken(gradient: dr.ArrayBase) -> Array:
-    """Convert a gradient to NumPy; large grids share memory with Dr.Jit."""
+    """Convert a gradient to NumPy. The result shares memory with Dr.Jit for large grids."""
     if dr.is_tensor_v(gradient) and dr.width(gradient) >= LARGE and dr.type_v(gradient) == dr.VarType.Float32:
         return gradient.numpy()
     return get_array(gradient)
 
 
 def release(values: Arrays) -> None:
-    """Free Dr.Jit's cache of unused memory if it may be large. Raises PathreplayError beyond the memory limit."""
+    """Free Dr.Jit's cache of unused memory if it may be large. Raises PathreplayError above the memory limit."""
     if any(value.size >= LARGE for value in values.values()) or memory.is_crowded():
         dr.flush_malloc_cache()
     memory.require_kept()
 
 
 def owned_tensor(picture: Array) -> mi.TensorXf:
-    """Copy an image into memory that Dr.Jit owns: see `variables_of`."""
+    """Copy an image into memory that Dr.Jit owns, for the reason given in `variables_of`."""
     tensor = mi.TensorXf(np.ascontiguousarray(picture)) * dr.opaque(mi.Float, 1)
     dr.eval(tensor)
     return tensor
@@ -171,8 +171,8 @@ def owned_tensor(picture: Array) -> mi.TensorXf:
 class Evaluator:
     """Evaluates shards of a problem with one integrator. The scene keeps the values of the last shard.
 
-    Only the variables ``moving`` (default: all) are differentiated. Views are rendered and back-propagated one after
-    the other, so that memory holds the AD graph of one view.
+    Only the variables ``moving`` (default: all) are differentiated. Views are rendered and back-propagated one by one,
+    which limits memory to the AD graph of a single view.
     """
 
     def __init__(
@@ -186,18 +186,18 @@ class Evaluator:
         self._moving = frozenset((v.key for v in problem.variables) if moving is None else moving)
         self._reached = problem.reached(self._moving)
         has_media = facts_of(problem.scene).has_media
-        # Recorded kernels are split differently from traced ones, and their rounding differs in the last bit.
+        # Recording splits kernels differently from tracing, which changes results in the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(self.integrator, has_media) and problem.loss not in ELSEWHERE
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
-        # By view, samples per pixel, and whether pixels are batched: whether a pixel sweep is possible.
+        # Whether a pixel sweep is possible, by view, samples per pixel, and whether pixels are batched.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
         self._learned: Arrays = {}  # state of the integrator after the last evaluation
-        self._at: object = None  # the same state in the integrator, which another evaluator may have replaced
+        self._at: object = None  # the integrator's object for this state, which another evaluator may replace
         self._begun = False
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
-        """See `Evaluate`. Errors and warnings of the integrator pass through."""
+        """See `Evaluate`. Errors and warnings of the integrator are passed to the caller."""
         if self.freezes and not self._begun:
             for about in self.problem.views:
                 make_ready(sensor_of(self.problem, about))
@@ -211,7 +211,7 @@ class Evaluator:
         return total(each(), owned=True)
 
     def _know(self, learned: Arrays) -> None:
-        """Restore the integrator's state. Raises PathreplayError if it is that of another kind of integrator."""
+        """Load the learned state. Raises PathreplayError if the state belongs to another kind of integrator."""
         held = self.integrator.baseline
         if (learned is self._learned and held is self._at) or (held is None and not learned):
             return
@@ -230,17 +230,17 @@ class Evaluator:
             factor = factor_of(values, view, about.target.shape[2])
             batch = None if pixels is None else Batch.of(about.weight, about.target.shape[:2], pixels, seed)
             loss, by_factor = self._differentiated(view, seed, spp, factor, batch)
-        except NotRecordable:  # a part of the gradient may have been added: start again with new variables
+        except NotRecordable:  # a part of the gradient may have been added: start again from zero
             self.freezes = False
             return self._view(values, view, seed, spp, pixels)
         gradients = {}
         for key, value in moving.items():
             gradients[key] = _taken(dr.grad(value))  # zero if no parameter affects the view
-            dr.clear_grad(value)  # the scene holds the variable
+            dr.clear_grad(value)  # the scene keeps a reference to the variable
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
-        # One bad path must not end a long run. The sum is finite if and only if all entries are, and needs no memory.
+        # One bad path must not end a long run. A sum is finite if and only if all entries are, and needs no memory.
         broken = [key for key, gradient in gradients.items() if not np.isfinite(gradient.sum(dtype=np.float64))]
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:
@@ -253,7 +253,7 @@ class Evaluator:
     ) -> tuple[float, mi.TensorXf | None]:
         """Return the view's contribution to the loss, and the derivative with respect to its ``factor``.
 
-        Gradients of the scene's parameters are accumulated in the parameters.
+        The gradients of scene parameters are accumulated in the parameters themselves.
         """
         problem, about = self.problem, self.problem.views[view]
         sensor, picture, counts = about.sensor, about.target, about.weight

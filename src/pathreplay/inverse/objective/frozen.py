@@ -1,8 +1,8 @@
-"""Computes loss and gradient of one view, with traced kernels or in a frozen function that replays recorded ones.
+"""Computes loss and gradient of one view, by tracing kernels or by a frozen function that replays recorded kernels.
 
 If the derivative of the loss is linear in each pixel, image and gradient come from one pass (see `pixel_sweep`). Other
-losses need the image first, and then a gradient pass with independent paths. If Dr.Jit can record both as a frozen
-function, later calls launch the kernels without tracing them again.
+losses need one pass for the image, and then a gradient pass with independent paths. If Dr.Jit can record the passes as
+a frozen function, later calls launch the kernels without tracing them again.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pathreplay.inverse.parameters.exposures import derivative
 from pathreplay.samplers.streams import Stream
 from pathreplay.scenes.parameters import keep_only
 
-# Part of every error message of Dr.Jit about a function that cannot be frozen. It is not known beforehand which plugins
-# prevent it: those of Mitsuba 3.9.1 that hide arrays from Dr.Jit (`orthographic`, `thinlens`).
+# Part of every error message of Dr.Jit about a function that cannot be frozen. Plugins that hide arrays from Dr.Jit
+# prevent freezing, e.g. `orthographic` and `thinlens` of Mitsuba 3.9.1. Only an attempt shows which plugins do so.
 _RECORDING = "while recording a frozen function"
 
 
@@ -45,19 +45,19 @@ class ViewTarget:
     """Factor on the rendered image, see `exposures`."""
 
     def compared(self, loss: Loss, image: mi.TensorXf) -> mi.Float:
-        """Return the mean loss of an image as rendered."""
+        """Return the mean loss of a rendered image, after multiplication by the factor."""
         return mean_loss(loss, _times(image, self.factor), self.target, self.weight).array
 
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """Sampling of a view."""
+    """Sensor, seed, samples and pixels of a rendering."""
 
     sensor: int
     seed: int | mi.UInt32
     spp: int
     batch: Batch | None = None
-    """Pixels to render, one per row of the target; None: all. Requires ``ViewLoss.swept``."""
+    """Pixels to render, in the order of the target's rows; None renders all. A batch requires ``ViewLoss.swept``."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class ViewLoss:
     loss: Loss
     share: float
     swept: bool
-    """Whether image and gradient come from one pixel sweep; the loss is quadratic then."""
+    """Whether image and gradient come from one pixel sweep, which requires a quadratic loss."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class ViewResult:
     loss: mi.Float
     state: PassState
     by_factor: mi.TensorXf | None
-    """Derivative by the logarithm of the target's factor, per channel."""
+    """Derivative with respect to the logarithm of `ViewTarget.factor`, per channel."""
 
 
 class NotRecordable(Exception):
@@ -85,8 +85,8 @@ class NotRecordable(Exception):
 
 
 def is_recordable(integrator: StatefulIntegrator, has_media: bool) -> bool:
-    """Whether passes of the integrator can be recorded in a scene with or without media, as far as that is known."""
-    # Spectral variants read Mitsuba's tables of colour matching functions, which are not inputs of the function.
+    """Return whether passes of the integrator can be recorded, as far as this is known before the first recording."""
+    # Spectral variants read Mitsuba's tables of colour matching functions, which are not inputs of frozen functions.
     return not mi.is_spectral and integrator.is_recordable(has_media)
 
 
@@ -106,7 +106,7 @@ class Recordings:
         target: ViewTarget,
         loss: ViewLoss,
     ) -> ViewResult:
-        """See the function `differentiate`. Raises NotRecordable, possibly after a part of the gradient was added."""
+        """See the function `differentiate`. Raises NotRecordable, possibly after adding a part of the gradient."""
         keys = list(params.keys())
         # One function per view, because Dr.Jit warns about functions that are recorded often.
         view = (request.sensor, *(dr.shape(params[key]) for key in keys))
@@ -157,13 +157,13 @@ def _differentiate(
     target: ViewTarget,
     loss: ViewLoss,
 ) -> ViewResult:
-    """Compute loss and gradient in passes that start from ``state``: see `differentiate`."""
+    """Compute loss and gradient as `differentiate` does, in passes that start from ``state``."""
     view = integrator.pass_of(scene, request.sensor, request.seed, request.spp)
     batch, factor = request.batch, target.factor
     share = loss.share if batch is None else loss.share * batch.share
     if loss.swept:
         offset, slope = (term * share for term in linear_derivative(loss.loss, target.target, target.weight))
-        # The exposed image is factor * image: by the chain rule, offset takes one factor, and slope two.
+        # The loss sees factor * image. By the chain rule, offset is multiplied by the factor, and slope by its square.
         wanted = _times(offset, factor), _times(_times(slope, factor), factor)
         image, state = integrator.pixel_pass(view, wanted, None if batch is None else batch.pixels, state)
         value = target.compared(loss.loss, image) * share
@@ -174,7 +174,7 @@ def _differentiate(
         value = target.compared(loss.loss, image) * share
         if dr.grad_enabled(value):
             dr.backward(value)
-            apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # as in `mi.render`
+            apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # derived as in `mi.render`
             state = integrator.gradient_pass(apart, dr.grad(image), state)
     by_factor = None
     if factor is not None:
@@ -191,7 +191,7 @@ def _times(tensor: mi.TensorXf, factor: mi.TensorXf | None) -> mi.TensorXf:
 def linear_derivative(
     loss: Loss, target: mi.TensorXf, weight: mi.TensorXf | None = None
 ) -> tuple[mi.TensorXf, mi.TensorXf]:
-    """Return offset and slope of the derivative of a quadratic loss with respect to the image."""
+    """Return offset and slope of the derivative of a quadratic loss: offset + slope · image."""
     bright = 1 + dr.abs(target)
     offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target, weight)
     return offset, (_derivative(loss, mi.TensorXf(bright), target, weight) - offset) / bright

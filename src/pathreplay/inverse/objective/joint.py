@@ -1,4 +1,4 @@
-"""Evaluation of a joint problem: each shard by the scene of its view."""
+"""Evaluation of joint problems, in which each shard belongs to one of several scenes."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from pathreplay.inverse.problem.joint import JointProblem
 
 
 class JointEvaluator:
-    """Evaluate shards of a joint problem by the evaluators of its parts; the views of a shard belong to one scene.
+    """Evaluates each shard of a joint problem with the evaluator of its scene.
 
-    Learned state is prefixed by the index of the scene.
+    All views of a shard belong to one scene. Names of learned state begin with the index of the scene.
     """
 
     def __init__(self, problem: JointProblem, parts: Sequence[Evaluate]) -> None:

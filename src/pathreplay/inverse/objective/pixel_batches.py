@@ -1,4 +1,4 @@
-"""Random batches of pixels, and the check whether a view supports them."""
+"""Random batches of pixels, and the check whether a view supports such batches."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Batch:
 
     pixels: mi.UInt32
     share: float
-    """Fraction of the image's pixels with a nonzero weight, which the batch represents."""
+    """Fraction of the image's pixels that have a nonzero weight, from which the batch is drawn."""
 
     @staticmethod
     def of(weight: Array | None, size: tuple[int, int], most: int, seed: int) -> Batch | None:
-        """Draw at most ``most`` pixels of an image of ``size`` (height, width); None if the image has no more."""
+        """Draw ``most`` random pixels of an image of ``size`` (height, width); None if the image has no more pixels."""
         height, width = size
         n = height * width
         if most >= n:
@@ -40,12 +40,12 @@ class Batch:
         return Batch(pixels, count / n)
 
     def rows(self, picture: Array) -> Array:
-        """Return the values of an image at these pixels, one row each."""
+        """Return the values of an image at the pixels of the batch, one pixel per row."""
         return picture.reshape(-1, 1, picture.shape[2])[np.array(self.pixels)]
 
 
 def obstacle(problem: Problem, integrator: StatefulIntegrator, sensor: int, spp: int, some: bool) -> str:
-    """Return why image and gradient cannot come from one pass over all pixels, or over ``some``; "" if they can."""
+    """Return why one pass over all pixels, or over ``some``, cannot give image and gradient, or "" if it can."""
     if problem.loss not in QUADRATIC:
         return "its loss is none of l2 and relative-l2; take one of these"
     return integrator.why_no_pixel_sweep(problem.scene, problem.scene.sensors()[sensor], spp, some)

@@ -28,9 +28,9 @@ def require_possible(problem: Problem) -> None:
 
 
 def require_reached(problem: Problem) -> None:
-    """Raise PathreplayError if the variables of the job, or of a stage, affect none of its views.
+    """Raise PathreplayError if the variables of a stage, or of a job without stages, affect none of its views.
 
-    Also raised if the integrator does not differentiate them.
+    The error is also raised if the integrator does not differentiate the variables.
     """
     for part in parts_of(problem):
         where = f"stages: stage {part.number + 1}: " if part.stage else ""
@@ -47,7 +47,7 @@ def require_reached(problem: Problem) -> None:
 
 
 def _require_differentiated(part: Part, sensor: int, where: str) -> None:
-    """Raise PathreplayError if the integrator, or its baseline, treats the variables as constants."""
+    """Raise PathreplayError if the integrator or the baseline of the problem treats the variables as constants."""
     problem = part.problem
     variables = variables_of(problem, {v.key: v.start for v in problem.variables})
     dr.enable_grad({key: value for key, value in variables.items() if key in part.moving})

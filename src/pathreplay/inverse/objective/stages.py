@@ -26,12 +26,12 @@ from pathreplay.scenes.descriptions import load_integrator
 
 @dataclass(frozen=True)
 class Part:
-    """The problem in one stage, or in the whole job if it has no stages."""
+    """The problem in one stage of a job, or in the whole job if the job has no stages."""
 
     number: int
     stage: Stage | None
     problem: Problem
-    """With the options of the stage, and the views that it trains on; their images are whole (see `scaled`)."""
+    """The problem with the options and training views of the stage. Its images are not downscaled (see `scaled`)."""
     moving: frozenset[str]
     """Variables that are differentiated and updated."""
 
@@ -42,7 +42,7 @@ class Part:
 
 
 def part_at(problem: Problem, iteration: int) -> Part:
-    """Return the part that an iteration belongs to."""
+    """Return the part (stage) that an iteration belongs to."""
     stages = problem.config.stages
     if stages is None:
         return Part(0, None, problem, frozenset(v.key for v in problem.variables))
@@ -51,7 +51,7 @@ def part_at(problem: Problem, iteration: int) -> Part:
 
 
 def parts_of(problem: Problem) -> list[Part]:
-    """Return the part of each stage, or the one part of a job without stages."""
+    """Return the part of each stage, or the single part of a job without stages."""
     stages = problem.config.stages
     return [_part(problem, n, stage) for n, stage in enumerate(stages)] if stages else [part_at(problem, 0)]
 
@@ -67,7 +67,7 @@ def _part(problem: Problem, number: int, stage: Stage) -> Part:
 
 
 def _views(problem: Problem, stage: Stage) -> set[str] | None:
-    """Return the names of the views of a stage; None: all. Raises PathreplayError for an unknown or test view."""
+    """Return the names of a stage's views, or None for all. Raises PathreplayError for an unknown or test view."""
     if stage.sensors is None:
         return None
     ids = {view.name: problem.scene.sensors()[view.sensor].id() for view in problem.views}
@@ -116,7 +116,7 @@ def require_stages(problem: Problem) -> None:
 
 
 def require_single_pixels(problem: Problem) -> None:
-    """Raise PathreplayError if pixels are batched in a view that does not support it."""
+    """Raise PathreplayError if pixels are batched in a view that does not support pixel batches."""
     config = problem.config
     for part in parts_of(problem):
         if part.problem.config.pixel_batch_size is None:
@@ -162,7 +162,7 @@ def _integrator(plugin: Plugin, max_depth: int) -> mi.Integrator:
 
 
 def scaled(view: View, downscale: int) -> View:
-    """Downscale target and weight of a view by box averages; masked pixels do not contribute."""
+    """Downscale target and weight of a view by averaging squares of pixels. Masked pixels do not contribute."""
     if downscale == 1:
         return view
     if view.weight is None:
@@ -180,7 +180,7 @@ def _means(image: Image, n: int) -> Image:
 
 
 class Staged:
-    """An `Evaluate` that applies the stage of each shard; keeps the evaluator of one stage at a time."""
+    """Evaluation function (`Evaluate`) that applies the stage of each shard, and keeps one evaluator at a time."""
 
     def __init__(self, problem: Problem, integrator: mi.Integrator, plugin: Plugin, record: bool = True) -> None:
         self.problem, self.integrator, self.plugin, self.record = problem, integrator, plugin, record
@@ -190,7 +190,7 @@ class Staged:
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`."""
         if self._number != shard.stage or self._evaluate is None:
-            self._evaluate, self._number = None, shard.stage  # free the old one first
+            self._evaluate, self._number = None, shard.stage  # free the previous evaluator first
             self._evaluate = self._evaluator(shard.stage)
         return self._evaluate(values, shard, learned)
 
@@ -200,7 +200,7 @@ class Staged:
         part = _part(self.problem, number, stage)
         if stage.max_depth is not None:
             integrator = _integrator(self.plugin, stage.max_depth)
-            stateful(integrator).silence(stateful(self.integrator).warned)  # do not repeat its warnings
+            stateful(integrator).silence(stateful(self.integrator).warned)  # do not repeat warnings
         views = tuple(scaled(view, stage.downscale) if not view.is_test else view for view in part.problem.views)
         return Evaluator(replace(part.problem, views=views), integrator, self.record, part.moving)
 
@@ -210,8 +210,8 @@ def evaluator_of(problem: Problem, integrator: mi.Integrator, plugin: Plugin) ->
 
     Args:
         problem: the problem.
-        integrator: evaluates the problem; joint problems use the integrators of their parts.
-        plugin: description of the integrator, from which stages create others.
+        integrator: integrator that renders and differentiates. Joint problems use the integrators of their parts.
+        plugin: description of the integrator, from which stages with another ``max_depth`` create their integrators.
 
     Returns:
         The evaluator.

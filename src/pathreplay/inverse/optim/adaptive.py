@@ -1,4 +1,4 @@
-"""The optimiser interface, with states that can be saved, and the optimisers of Dr.Jit."""
+"""Interface of optimisers whose state can be saved, and an adapter for the optimisers of Dr.Jit."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 _CLASSES = {"adam": drjit.opt.Adam, "adamw": drjit.opt.AdamW, "sgd": drjit.opt.SGD, "rmsprop": drjit.opt.RMSProp}
-# State arrays in Dr.Jit's order: first moment, second moment, maximum of the second moment (AMSGrad); velocity of SGD.
+# Names of state arrays. Adam and AdamW have the first moment, the second moment and, with AMSGrad, the maximum of the
+# second moment, in Dr.Jit's order. RMSProp has the second moment, and SGD the velocity.
 _FIRST, _SECOND, _GREATEST, _VELOCITY = "first", "second", "greatest", "velocity"
 _KEPT = {"sgd": (_VELOCITY,), "rmsprop": (_SECOND,)}
 _MOMENTS = _FIRST, _SECOND, _GREATEST
 PIECE = 2**22
-"""Number of entries of a large variable that are stepped at once; each temporary of a step then takes 16 MB."""
+"""Maximum number of entries per step. Larger variables are stepped in pieces, to limit temporary arrays to 16 MB."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,11 @@ class State:
     steps: dict[str, int]
     """Number of steps of each variable since its state was last reset."""
     arrays: Mapping[str, Array]
-    """State arrays by name, ``what:variable``."""
+    """State arrays by name. `DrJitOptimiser` uses names ``kind:key``, e.g. ``first:KEY`` for the first moment."""
 
 
 class Optimiser(Protocol):
-    """Interface of optimisers; arrays are indexed by the key of the variable.
+    """Interface of optimisers. Dictionaries are indexed by the key of the variable.
 
     If the shape of a variable changes, its state is reset. Variables that are missing from a step keep their state.
     """
@@ -69,13 +70,14 @@ class Optimiser(Protocol):
 class DrJitOptimiser:
     """An optimiser of ``drjit.opt``.
 
-    Large variables are stepped in pieces (see `PIECE`). Between steps, only their state is kept, not their values.
+    Large variables are stepped in pieces (see `PIECE`). Between steps, the optimiser keeps the state of each variable,
+    but no copy of its values.
 
     Args:
         values: initial values by key.
         options: type and options of the optimiser; default: Adam.
-        uniform: keys of variables whose entries Adam and AdamW normalise by their largest second moment (UniformAdam),
-            so that entries with small gradients hardly move.
+        uniform: keys of variables for which Adam and AdamW normalise all entries by the variable's largest second
+            moment (UniformAdam). Entries with small gradients then hardly move.
     """
 
     finished = ""
@@ -103,7 +105,7 @@ class DrJitOptimiser:
         return self._parts[self._is_uniform(key)]
 
     def _pieces(self, key: str) -> dict[str, slice]:
-        """Return the pieces of a variable by their names in Dr.Jit's optimiser."""
+        """Return the pieces of a variable by their names in Dr.Jit's optimiser. Uniform variables are one piece."""
         size = prod(self._shapes[key])
         length = max(size, 1) if self._is_uniform(key) else self._piece
         return {f"{key}:{begin}": slice(begin, min(begin + length, size)) for begin in range(0, size, length)}
@@ -131,7 +133,7 @@ class DrJitOptimiser:
         for even, part in self._parts.items():
             mine = [key for key in values if self._is_uniform(key) == even]
             pieces = {name: (key, piece) for key in mine for name, piece in self._pieces(key).items()}
-            # Floats, because Dr.Jit 1.5.0 multiplies rates that are arrays in place, which also scales AdamW's decay.
+            # Rates must be floats: Dr.Jit 1.5.0 multiplies array rates in place, which would also scale AdamW's decay.
             part.set_learning_rate({name: rates[key] for name, (key, _) in pieces.items()})
             known = part.state
             for names in _together(pieces, self._piece):
@@ -154,13 +156,13 @@ class DrJitOptimiser:
         return {}
 
     def _remembered(self, name: str, part: drjit.opt.Optimizer) -> dict[str, dr.ArrayBase]:
-        """Return the state of a piece as Dr.Jit arrays, by kind."""
+        """Return the state arrays of a piece of a variable, by kind (first moment, etc.)."""
         kept = part.state[name][3]
         arrays = kept[1:] if self._moments else (kept,)
         return {what: array for what, array in zip(self._names, arrays, strict=True) if array is not None}
 
     def state(self) -> State:
-        """See `Optimiser`; the arrays are moments, or the velocity of SGD, and are assembled on access."""
+        """See `Optimiser`. Each array is assembled from the pieces of its variable when it is accessed."""
         kinds = {key: self._remembered(next(iter(self._pieces(key))), self._of(key)) for key in self._steps}
         makers = {f"{what}:{key}": partial(self._whole, what, key) for key in self._steps for what in kinds[key]}
         return State(dict(self._steps), WhenAsked(makers))
@@ -200,13 +202,13 @@ class DrJitOptimiser:
 
 
 def _let_go(part: drjit.opt.Optimizer, name: str) -> None:
-    """Replace the value of a piece by literal zeros of its shape, which take no memory; its state is kept."""
+    """Replace the value of a piece by literal zeros, which take no memory, and keep the state of the piece."""
     value, *rest = part.state[name]
     part.state[name] = (dr.zeros(type(value), value.shape), *rest)
 
 
 def _together(pieces: Mapping[str, tuple[str, slice]], most: int) -> Iterator[list[str]]:
-    """Group pieces to be stepped at once, with up to ``most`` entries per group."""
+    """Group the pieces that are stepped at once. A group has at most ``most`` entries, or is a single larger piece."""
     group: list[str] = []
     size = 0
     for name, (_, piece) in pieces.items():

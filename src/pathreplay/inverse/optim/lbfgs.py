@@ -1,9 +1,11 @@
-"""Search methods of SciPy, L-BFGS-B and others, as an `Optimiser` that gets one loss and gradient at a time.
+"""Adapter of SciPy's minimisers, such as L-BFGS-B, to the `Optimiser` interface.
 
-Each iteration of a job is one function evaluation, which may be a trial step of the line search with a larger loss than
-before. The result is the best evaluation. SciPy does not expose its state, but it is deterministic: at each iteration
-it is restarted and answered from the record of past evaluations, until it requests a new one. This takes negligible
-time compared with rendering, and makes resuming from a checkpoint exact to the bit.
+Each iteration of a job is one function evaluation. It may be a trial step of the line search, whose loss may exceed the
+previous loss. The result of a run is the evaluation with the lowest loss.
+
+SciPy's minimisers do not expose their state, but they are deterministic. Each iteration therefore restarts the
+minimiser and replays the recorded evaluations, until the minimiser requests a new evaluation. The replay takes
+negligible time compared with rendering, and makes resuming from a checkpoint exact to the bit.
 """
 
 from __future__ import annotations
@@ -22,13 +24,13 @@ from pathreplay.inverse.optim.adaptive import State
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 MOST = 1000
-"""Largest number of parameter entries; the record of evaluations, and so a checkpoint, grows with each iteration."""
+"""Maximum number of parameter entries, because checkpoints contain the gradients of all iterations."""
 
 ENDLESS = 10**9
 
 Vector = NDArray[np.float64]
 Search = Callable[..., object]
-"""search(function, start, jac=True, bounds=...) -> anything; see `LineSearch`."""
+"""Minimiser ``search(function, start, jac=True, bounds=...)``, whose result may be any object; see `LineSearch`."""
 _START, _SCALE, _LOSSES, _GRADIENTS, _NEXT = (f"search:{n}" for n in ("start", "scale", "losses", "gradients", "next"))
 
 
@@ -37,19 +39,20 @@ class _Asked(Exception):
 
 
 class LineSearch:
-    """A search method with bounds.
+    """Optimiser that runs a deterministic minimiser with bounds.
 
-    Variables are scaled by their initial learning rates, losses by the initial loss.
+    The minimiser sees variables divided by their initial learning rates, and losses divided by the initial loss.
 
     Args:
         values: initial values by key.
         options: options of the optimiser.
         bounds: lower and upper bound of each variable, by key.
-        search: a deterministic function with the interface of `scipy.optimize.minimize`, called with a function that
-            returns loss and gradient, the start, ``jac=True`` and ``bounds``. Default: L-BFGS-B with ``options``.
+        search: deterministic minimiser with the interface of `scipy.optimize.minimize`; default: L-BFGS-B with
+            ``options``. Its arguments are a function that returns loss and gradient, the start point, ``jac=True`` and
+            ``bounds``.
 
     Raises:
-        PathreplayError: there are more than `MOST` entries.
+        PathreplayError: the variables have more than `MOST` entries in total.
     """
 
     def __init__(
@@ -77,7 +80,7 @@ class LineSearch:
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
     ) -> dict[str, Array]:
-        """See `Optimiser`; returns the next point to evaluate, or the best one if the search has finished."""
+        """See `Optimiser`. Returns the next point to evaluate, or the best point if the search has finished."""
         if self.finished:
             return self.answer()
         if not self._losses:
@@ -89,7 +92,7 @@ class LineSearch:
         return self.answer() if self.finished else self._split(self._next)
 
     def _ask(self) -> None:
-        """Run SciPy on the record of evaluations, until it requests a new point or finishes."""
+        """Run the minimiser on the recorded evaluations, until it requests a new evaluation or finishes."""
         self._points, unit = [], abs(self._losses[0]) or 1.0
 
         def recorded(x: Vector) -> tuple[float, Vector]:
@@ -127,11 +130,11 @@ class LineSearch:
         return parts
 
     def answer(self) -> dict[str, Array]:
-        """Return the point with the lowest loss so far; empty before the first step."""
+        """Return the point with the lowest loss so far, or an empty dictionary before the first step."""
         return self._split(self._points[int(np.argmin(self._losses))]) if self._losses else {}
 
     def state(self) -> State:
-        """See `Optimiser`; the state is the record of evaluations."""
+        """See `Optimiser`. The state consists of start, scales, recorded evaluations and next point."""
         steps = dict.fromkeys(self._shapes, len(self._losses))
         if not self._losses:
             return State(steps, {})

@@ -33,13 +33,13 @@ class Derived:
     of: tuple[str, ...]
     """Keys of the variables that the function takes after p₀."""
     first: SceneValue
-    """The decoded value p₀ in the scene; detached."""
+    """The decoded value p₀ in the scene (see `Form`), detached."""
     form: Form
     """Conversion between the decoded value and the value that Mitsuba stores."""
     truth: Array | None = None
 
     def value(self, variables: Mapping[str, SceneValue]) -> SceneValue:
-        """Compute the decoded value p; derivatives propagate to the variables.
+        """Compute the decoded value p. Derivatives propagate to the variables.
 
         Args:
             variables: Dr.Jit values by key.
@@ -71,16 +71,16 @@ class Derived:
 
 
 def _matrix(kind: type, value: object) -> object:
-    """Convert a value to an argument of the constructor of a transform."""
+    """Convert a matrix to a type that the constructor of the transform ``kind`` accepts."""
     return value if isinstance(value, kind) else type(kind().matrix)(value)
 
 
 def make_derived(
     params: mi.SceneParameters, keys: Mapping[str, Derivation], variables: list[Variable], modules: Modules
 ) -> tuple[Derived, ...]:
-    """Make the derived parameters and evaluate each once per resolution of its variables.
+    """Make the derived parameters, and evaluate each of them once per resolution of its variables.
 
-    Their true values are not set here.
+    The true values of the parameters are not set here.
 
     Raises:
         PathreplayError: a variable does not exist, or a function cannot be imported, fails, returns an invalid value or
@@ -102,7 +102,7 @@ def make_derived(
 def _named(
     name: str, key: str, keys: Mapping[str, Derivation], params: mi.SceneParameters, variables: list[Variable]
 ) -> Variable:
-    """Return the variable with a name. Raises PathreplayError if there is none."""
+    """Return the variable with a name. Raises PathreplayError if no variable has this name."""
     known = {v.key: v for v in variables}
     if name in known:
         return known[name]

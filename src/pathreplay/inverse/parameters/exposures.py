@@ -1,8 +1,8 @@
 """Exposures: scale factors on the rendered image of each view, recovered as one additional variable.
 
-With a factor e, the loss f compares e I with the target T, and its derivative by e is f'(e I, T) I. Using one rendering
-for both occurrences of I would bias e towards small values, because their noise is correlated. The estimator therefore
-uses two independent renderings A and B: f'(e A, T) B.
+The loss f compares the product of a factor e and the image I with the target T. The derivative of the loss with respect
+to e is f'(e I, T) I. If both occurrences of I were the same rendering, their noise would be correlated and bias e
+towards small values. The estimator f'(e A, T) B therefore uses two independent renderings A and B.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ EXPOSURE = "exposure"
 
 
 class Factors:
-    """Logarithmic coordinates of the factors (`Coordinates`), with their common scale fixed.
+    """Logarithmic coordinates (`Coordinates`) of the factors, with a fixed common scale.
 
-    After each step, the mean logarithm over the rows ``fixed`` is subtracted per colour: their geometric mean stays 1.
-    If ``fixed`` is empty, nothing is subtracted.
+    After each step, the mean logarithm over the rows ``fixed`` is subtracted for each colour, which keeps the geometric
+    mean of these rows at 1. If ``fixed`` is empty, nothing is subtracted and the common scale is free.
     """
 
     uniform = False
@@ -41,7 +41,7 @@ class Factors:
         return self._log.latent(values)
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """See `Coordinates`; includes the derivative of the subtracted mean."""
+        """See `Coordinates`. The gradient includes the derivative of the subtracted mean."""
         by_latent = self._log.gradient(values, by_values)
         if self.fixed:
             by_latent[self.fixed] -= by_latent.sum(axis=0) / len(self.fixed)
@@ -61,7 +61,7 @@ def start(views: int, channels: int, white_balance: bool) -> Array:
 
 
 def factor_of(values: Arrays, view: int, channels: int) -> Image | None:
-    """Return the factor on the image of a view, shape (1, 1, channels), 1 for alpha; None without exposures."""
+    """Return the factors (1, 1, channels) on the image of a view, with 1 for alpha, or None without exposures."""
     if EXPOSURE not in values:
         return None
     row = values[EXPOSURE][view]
@@ -79,7 +79,7 @@ def exposed(values: Arrays, view: int, picture: Image) -> Image:
 def derivative(
     loss: Loss, a: mi.TensorXf, b: mi.TensorXf, factor: mi.TensorXf, target: mi.TensorXf, weight: mi.TensorXf | None
 ) -> mi.TensorXf:
-    """Estimate the derivative of the mean loss by the logarithm of the factor of each channel.
+    """Estimate the derivative of the mean loss with respect to the logarithm of each channel's factor.
 
     Args:
         loss: the loss function.
@@ -99,7 +99,7 @@ def derivative(
 
 
 def gradient(values: Arrays, view: int, by_log: Array) -> Array:
-    """Convert the result of `derivative` for one view to a gradient of the whole variable."""
+    """Convert the result of `derivative` for one view to a gradient with respect to the whole variable."""
     rows = values[EXPOSURE]
     by_factors = np.zeros_like(rows)
     colours = by_log[: len(by_log) - (len(by_log) in (2, 4))]
@@ -108,7 +108,7 @@ def gradient(values: Arrays, view: int, by_log: Array) -> Array:
 
 
 def fitted(picture: Image, target: Image, weight: Image | None, each: bool) -> Array:
-    """Fit the factors of an image to its target by least squares: one per colour if ``each``, else one for all."""
+    """Fit factors on an image to its target by least squares: one per colour if ``each``, or one for all colours."""
     colours = picture.shape[2] - (picture.shape[2] in (2, 4))
     w = np.ones((1, 1, 1)) if weight is None else weight.astype(np.float64)
     a, t = (image[:, :, :colours].astype(np.float64) for image in (picture, target))
@@ -119,7 +119,7 @@ def fitted(picture: Image, target: Image, weight: Image | None, each: bool) -> A
 
 
 def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Image, Image, Image | None]]) -> Arrays:
-    """Return the values with fitted factors for test views, which the optimisation does not determine.
+    """Return the values with fitted factors for the test views, which are not part of the loss.
 
     Args:
         values: values by key.
@@ -132,7 +132,7 @@ def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Imag
 
 
 def fixed_rows(names: Iterable[str], trained: Iterable[int], reference: str | None, free: bool) -> list[int]:
-    """Return the rows whose mean `Factors` fixes: none if ``free``, the reference view, or all training views."""
+    """Return the rows whose mean `Factors` fixes: the reference view or all training views, or no row if ``free``."""
     if free:
         return []
     return list(trained) if reference is None else [list(names).index(reference)]

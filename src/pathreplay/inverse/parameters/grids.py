@@ -17,13 +17,13 @@ from pathreplay.inverse.images.io import Image
 Array = NDArray[np.float32]
 
 LARGEST_SHOWN = 2048
-"""Largest side in pixels of a displayed texture; it exceeds a screen and keeps report pages small."""
+"""Maximum side length of a displayed texture in pixels: larger than a screen, but small enough for report pages."""
 _PIECE = 2**22
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Refinement schedule of a grid: it has the shape ``shapes[j]`` from iteration ``begins[j]`` on."""
+    """Refinement schedule of a grid, which has the shape ``shapes[j]`` from iteration ``begins[j]`` on."""
 
     shapes: tuple[tuple[int, ...], ...]
     begins: tuple[int, ...]
@@ -38,7 +38,7 @@ def make_levels(shape: Sequence[int], longest: Sequence[int], refine_at: Sequenc
 
     Args:
         shape: shape of the grid in the scene.
-        longest: number of entries along the longest axis, per level; the other axes keep the proportions.
+        longest: number of entries along the longest axis for each level. The other axes are scaled in proportion.
         refine_at: first iteration of the second and each later level.
     """
     *axes, channels = shape
@@ -48,10 +48,11 @@ def make_levels(shape: Sequence[int], longest: Sequence[int], refine_at: Sequenc
 
 
 def resampled(grid: Array, shape: Sequence[int]) -> Array:
-    """Resample a grid to another ``shape`` with the same channels, linearly between cell centres and clamped outside.
+    """Resample a grid to ``shape`` by linear interpolation between cell centres, clamped at the border.
 
-    This matches the texture and volume lookup of Mitsuba, so doubling the resolution hardly changes the function. The
-    result stays within the range of the values. Downsampling by more than a factor of two skips entries.
+    The number of channels stays the same. Textures and volumes of Mitsuba interpolate in the same way, so doubling the
+    resolution hardly changes the texture. The result stays within the range of the values. Downsampling by more than a
+    factor of two skips entries.
     """
     factors = [new / old for new, old in zip((*shape[:-1], grid.shape[-1]), grid.shape, strict=True)]
     return scipy.ndimage.zoom(grid, factors, np.float32, order=1, mode="nearest", grid_mode=True)
@@ -64,14 +65,14 @@ def comparable(shape: Sequence[int], other: Sequence[int]) -> bool:
 
 
 def matched(grid: Array, other: Array) -> Array:
-    """Resample ``grid`` to the shape of ``other``; the two must be `comparable`."""
+    """Resample ``grid`` to the shape of ``other``. The two shapes must be `comparable`."""
     return grid if grid.shape == other.shape else resampled(grid, other.shape)
 
 
 def rmse(value: Array, truth: Array) -> float:
-    """Compute the root mean square error; a grid is resampled to the resolution of the truth."""
+    """Compute the root mean square error of values. A grid is resampled to the resolution of the true values."""
     a, b = matched(value, truth).reshape(-1), truth.reshape(-1)
-    # In pieces, because temporaries in double precision need four times the memory of the values.
+    # Work in pieces, because temporary arrays in double precision need four times the memory of the values.
     squares = [
         float(np.square(a[i : i + _PIECE].astype(np.float64) - b[i : i + _PIECE]).sum())
         for i in range(0, b.size, _PIECE)

@@ -15,9 +15,10 @@ from pathreplay.inverse.config.parameter_options import Parameter
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.platform import memory
 
-# Bytes per optimised number: old, new and Dr.Jit's value, gradient and gradient sum, Adam's two moments, a temporary.
+# Bytes per optimised number, for eight floats: the old value, the new value, the copy in Dr.Jit, the gradient, the sum
+# of gradients, Adam's two moments and a temporary.
 _A_VALUE = 32
-# Largest ratio of a learning rate, which is about the step length of Adam, to the values.
+# Largest ratio of a learning rate to the values. The learning rate is about the length of Adam's steps.
 _LONGEST_STEP = 1e6
 # Largest ratio of a pivot or displacement to the extent of the scene.
 _FARTHEST = 1e4
@@ -29,7 +30,7 @@ def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> 
     largest = max(axes)
 
     def cells(size: int) -> int:
-        # Python integers, which do not overflow for any input.
+        # This uses Python integers, which never overflow.
         return channels * prod(max(min(n, 2), (n * size + largest // 2) // largest) for n in axes)
 
     wanted = max(resolutions)
@@ -46,7 +47,7 @@ def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> 
 
 
 def require_values(sizes: Mapping[str, int]) -> None:
-    """Raise PathreplayError unless variables and optimiser state fit into memory; ``sizes`` are entries by key."""
+    """Raise PathreplayError unless variables of these ``sizes``, by key, and their optimiser state fit into memory."""
     largest = max(sizes, key=lambda key: sizes[key])
     thing = f"Optimising {sum(sizes.values())} numbers ('{largest}' has {sizes[largest]})"
     memory.require(sum(sizes.values()) * _A_VALUE, thing, "use fewer parameters, or coarser textures and volumes")
@@ -65,14 +66,14 @@ def require_learning_rate(key: str, rate: float, start: np.ndarray, bounds: Sequ
 def require_near(scene: mi.Scene, key: str, value: Array, entry: Parameter) -> None:
     """Raise PathreplayError if the pivot or initial displacement of a pose is implausibly large.
 
-    Coordinates are limited to ten thousand times the extent of the scene, beyond which rounding in single precision
-    (relative error 1e-7) exceeds a thousandth of the extent. Rotations are limited to one full turn.
+    Coordinates are limited to ten thousand times the extent of the scene. Beyond this limit, rounding errors of single
+    precision (1e-7, relative) exceed a thousandth of the extent. Rotations are limited to one full turn.
 
     Args:
         scene: the scene.
         key: key of the parameter.
-        value: its value, a 4 x 4 matrix or vertex positions.
-        entry: its table in the job.
+        value: value of the parameter, a 4 x 4 matrix or vertex positions.
+        entry: table of the parameter in the job.
     """
     box = scene.bbox()
     corners = [np.array(box.min), np.array(box.max)] if box.valid() else []

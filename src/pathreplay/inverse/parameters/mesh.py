@@ -1,12 +1,12 @@
 """Preconditioned mesh optimisation: "Large Steps in Inverse Rendering of Geometry" (Nicolet et al. 2021).
 
-Gradients of vertex positions are noisy, and often only vertices near silhouettes have one. The
-optimiser therefore does not step the vertices v but
+Gradients of vertex positions are noisy, and often only vertices near silhouettes have a nonzero gradient. The optimiser
+therefore steps a function u of the vertices v:
 
-    u = (I + λ L) v,        where L is the combinatorial Laplacian of the mesh,
+    u = (I + λ L) v,        where L is the combinatorial Laplacian of the mesh.
 
-so that a step δu moves the vertices by the smooth displacement (I + λ L)⁻¹ δu. This is Mitsuba's `mi.ad.LargeSteps`,
-with the sparse solver of SciPy.
+A step δu moves the vertices by the smooth displacement (I + λ L)⁻¹ δu. Mitsuba's `mi.ad.LargeSteps` implements the same
+method; this module uses the sparse solver of SciPy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = NDArray[np.float32]
 class Surface:
     """Large Steps coordinates (`Coordinates`) of a mesh with n vertices and m faces.
 
-    Vertices with equal positions are merged, so that no seam opens.
+    Vertices with equal positions are merged, because steps would otherwise open seams.
 
     Args:
         positions: vertex positions, 3 n floats.
@@ -53,7 +53,7 @@ class Surface:
         return self._spread(self._solver.solve(points))
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """Convert the gradient with respect to v to that with respect to u, which merged vertices share."""
+        """Convert the gradient with respect to v to the gradient with respect to u, which merged vertices share."""
         total = np.zeros((self._matrix.shape[0], 3))
         np.add.at(total, self._copies, by_values.reshape(-1, 3))
         return self._spread(self._solver.solve(total))

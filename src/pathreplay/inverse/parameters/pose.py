@@ -1,4 +1,4 @@
-"""Poses: rigid motions of transforms and meshes as variables, and their errors.
+"""Poses: rigid motions of transforms and meshes as variables, and errors of poses.
 
 With the transform M₀ of the scene, the pivot c, the translation t and the rotation vector r (axis times angle),
 
@@ -28,7 +28,8 @@ from pathreplay.scenes.parameters import SceneValue, get_array, is_transform
 PART_NAMES = (":translation", ":rotation")
 """Suffixes of the keys of the variables of a pose."""
 
-# Below this θ², series replace a and b; the omitted terms, θ⁴ / 120 and θ⁴ / 720, are below float32 rounding there.
+# For smaller θ², a and b are evaluated by series. The omitted terms, θ⁴ / 120 and θ⁴ / 720, are then below the rounding
+# error of single precision.
 _SMALL = 1e-3
 
 
@@ -39,7 +40,7 @@ class Pose:
     key: str
     kind: PoseKind
     base: SceneValue
-    """M₀ or the vertex positions in the scene; detached."""
+    """M₀ or the vertex positions in the scene, detached."""
     pivot: tuple[float, float, float]
     distance: float | None
     """Length relative to which position errors are reported."""
@@ -47,7 +48,7 @@ class Pose:
     """The transform or the vertex positions in the target scene."""
 
     def parts(self) -> dict[str, str]:
-        """Map 'translation' and 'rotation', as far as the pose has them, to the keys of their variables."""
+        """Return the keys of the variables of the pose, indexed by 'translation' and 'rotation'."""
         return {part: f"{self.key}:{part}" for part in PARTS[self.kind]}
 
     @property
@@ -56,7 +57,7 @@ class Pose:
         return tuple(self.parts().values())
 
     def value(self, variables: Mapping[str, Any]) -> SceneValue:
-        """Compute the value of the scene parameter; derivatives propagate to the variables.
+        """Compute the value of the scene parameter. Derivatives propagate to the variables.
 
         Args:
             variables: ``mi.Vector3f`` of width 1 by key: translation in scene units, rotation vector in radians.
@@ -70,12 +71,13 @@ class Pose:
             A = mi.Matrix4f(R)
             for row, entry in enumerate(shift - R @ c):
                 A[row, 3] = entry
-            # One product with an affine matrix keeps the last row exact: cameras divide by the homogeneous coordinate.
+            # A single product with an affine matrix keeps the last row exact. Cameras need this, because they divide by
+            # the homogeneous coordinate.
             return type(self.base)(type(self.base.matrix)(A @ mi.Matrix4f(self.base.matrix)))
         return dr.ravel(R @ (dr.unravel(mi.Vector3f, self.base) - c) + shift)
 
     def error(self, value: NDArray[np.float32]) -> PoseError | None:
-        """Compare ``value`` (from `get_array`) with the true pose; returns None if that is unknown."""
+        """Compare ``value`` (from `get_array`) with the true pose. Returns None if the true pose is unknown."""
         if self.truth is None:
             return None
         a, b = value.astype(np.float64), self.truth.astype(np.float64)
@@ -120,7 +122,7 @@ def make_pose(key: str, value: SceneValue, kind: PoseKind, pivot: list[float] | 
 
     Args:
         key: key of the parameter.
-        value: its value in the scene.
+        value: value of the parameter in the scene.
         kind: which parts of the motion are variables.
         pivot: centre of rotation; default: the origin of the transform, or the mean of the vertices.
         distance: length relative to which position errors are reported.
@@ -144,7 +146,7 @@ def make_pose(key: str, value: SceneValue, kind: PoseKind, pivot: list[float] | 
 
 
 def rotation_matrix(r: mi.Vector3f) -> mi.Matrix3f:
-    """Compute R(r) for a rotation vector in radians; the derivative is finite at r = 0, too."""
+    """Compute R(r) for a rotation vector in radians. The derivative is finite even at r = 0."""
     θ2 = dr.squared_norm(r)
     small = θ2 < _SMALL
     safe = dr.select(small, _SMALL, θ2)

@@ -1,7 +1,8 @@
 """Regularizers: terms of the loss that depend on the values of a parameter alone.
 
-Each `Term` maps decoded values v to a number and its gradient by v. `total_variation`, `l2_to` and `laplacian` are the
-same terms as functions of Dr.Jit tensors, from which a ``regularizer`` of a parameter can be composed:
+Each `Term` maps values v to a number and the gradient of this number with respect to v. The functions
+`total_variation`, `l2_to` and `laplacian` compute the same terms from Dr.Jit tensors. A ``regularizer`` of a parameter
+can be composed of these functions:
 
     Parameter(regularizer=lambda v: 0.1 * total_variation(v) + dr.mean(dr.square(v - 0.5), axis=None))
 """
@@ -25,7 +26,7 @@ from pathreplay.inverse.parameters.neighbours import neighbours
 from pathreplay.inverse.parameters.values import Array
 
 ROUND = 1e-3
-"""Smoothing length r of total variation: it is quadratic for smaller differences."""
+"""Smoothing length r of total variation, which is quadratic for differences much smaller than r."""
 
 Term = Callable[[Array], tuple[float, NDArray[np.floating]]]
 """Maps values to a term of the loss and its gradient, which has the shape of the values."""
@@ -51,7 +52,7 @@ class Penalty:
 class TotalVariation:
     """Total variation w · Σ mean(√(Δv² + r²) - r) of a grid.
 
-    The sum is over the spatial axes, the mean over all differences Δv of neighbours along an axis, and r is `ROUND`.
+    The sum is over the spatial axes. The mean is over the differences Δv of all neighbours along an axis. r is `ROUND`.
     """
 
     weight: float
@@ -72,7 +73,7 @@ class TotalVariation:
 
 @dataclass(frozen=True)
 class Prior:
-    """Quadratic penalty w · mean (v - start)²; a start of another resolution is resampled."""
+    """Quadratic penalty w · mean (v - start)². For grids, ``start`` is resampled to the resolution of the values v."""
 
     weight: float
     start: Array
@@ -85,10 +86,11 @@ class Prior:
 
 
 class Laplacian:
-    """Laplacian penalty w · mean |v - mean of its neighbours|² over the vertices v of a mesh, which smooths bumps.
+    """Laplacian penalty w · mean |v - mean of the neighbours of v|² over the vertices v of a mesh.
 
-    It is in squared scene units, independent of the size of the mesh, and decreases as the mesh is refined. Vertices
-    with equal initial positions are merged into one vertex at their current mean position.
+    The penalty smooths bumps. It is in squared scene units and normalised by the number of vertices. It decreases as
+    the mesh is refined, because neighbours are then closer to each other. Vertices with equal initial positions are
+    merged into one vertex at their current mean position.
 
     Args:
         weight: the weight w.
@@ -114,7 +116,7 @@ class Laplacian:
 
 @dataclass(frozen=True)
 class Own:
-    """A user function of a tensor of values that returns one number, differentiated by Dr.Jit.
+    """A user function that maps a tensor of values to one number, differentiated by Dr.Jit.
 
     The gradient is zero if the result does not depend on the values, e.g. if the function returns a constant 0.
     """
@@ -140,13 +142,15 @@ class Own:
 
 
 def total_variation(values: mi.TensorXf) -> mi.TensorXf:
-    """Compute the total variation of a grid: the sum over its axes of mean √(Δv² + r²) - r, with r = `ROUND`.
+    """Compute the total variation Σ mean(√(Δv² + r²) - r) of a grid, where r is `ROUND`.
+
+    The sum is over the spatial axes. The mean is over the differences Δv of all neighbours along an axis.
 
     Args:
         values: a texture (height, width, channels) or a volume (depth, height, width, channels).
 
     Returns:
-        The total variation, differentiable by the values.
+        The total variation, differentiable with respect to the values.
     """
     return _differentiable(TotalVariation(1.0), values)
 
@@ -155,10 +159,10 @@ def l2_to(reference: ArrayLike) -> Callable[[mi.TensorXf], mi.TensorXf]:
     """Create the function that computes the mean squared difference from an array.
 
     Args:
-        reference: array in the shape of the values; a grid is resampled to their resolution.
+        reference: array in the shape of the values. A grid is resampled to the resolution of the values.
 
     Returns:
-        A function of the values that returns one number, differentiable by the values.
+        A differentiable function that maps the values to one number.
     """
     return partial(_differentiable, Prior(1.0, np.array(reference, np.float32)))
 
@@ -167,11 +171,11 @@ def laplacian(positions: ArrayLike, faces: ArrayLike) -> Callable[[mi.TensorXf],
     """Create the function that computes the mean squared distance of vertices from the mean of their neighbours.
 
     Args:
-        positions: vertex positions, (n, 3) or flat; vertices at the same position count as one.
+        positions: vertex positions, (n, 3) or flat. Vertices at the same position are merged.
         faces: vertex indices of the triangles, (m, 3) or flat.
 
     Returns:
-        A function of vertex positions that returns one number, in squared scene units, differentiable by them.
+        A differentiable function that maps vertex positions to one number, in squared scene units.
     """
     vertices, triangles = np.array(positions, np.float32).ravel(), np.array(faces).ravel()
     return partial(_differentiable, Laplacian(1.0, vertices, triangles))

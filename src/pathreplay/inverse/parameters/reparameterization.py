@@ -13,10 +13,10 @@ from pathreplay.inverse.config.parameter_options import TransformKind
 from pathreplay.inverse.parameters.values import Array
 
 CLOSEST = 1e-6
-"""Smallest distance of values from a bound, relative to the range; closer to it, the derivative by u vanishes."""
+"""Minimum distance from a bound, relative to the range. Any closer, the derivative with respect to u would vanish."""
 
 LARGEST_LOG = 88.0
-"""Largest logarithm of a value; above it, single precision overflows."""
+"""Maximum logarithm of a value. The exponential of a larger number overflows in single precision."""
 
 
 class Coordinates(Protocol):
@@ -29,7 +29,7 @@ class Coordinates(Protocol):
         """Compute u from v."""
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """Convert the gradient by v at ``values`` to the gradient by u."""
+        """Convert the gradient with respect to v, at ``values``, to the gradient with respect to u."""
 
     def values(self, latent: Array) -> Array:
         """Compute v from u."""
@@ -42,7 +42,7 @@ class Transform:
     softplus  v = lower + log(1 + exp u)
     logit     v = lower + (upper - lower) / (1 + exp(-u))
 
-    The computation is in double precision, the results are in single precision.
+    The computation is in double precision. The results are in single precision.
     """
 
     uniform = False
@@ -97,7 +97,7 @@ class Transform:
         return np.asarray(self._inside(v), np.float32)
 
     def _inside(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Clamp the values to a small distance from the bounds."""
+        """Clamp the values to keep a small distance from the bounds (see `CLOSEST`)."""
         v = values.astype(np.float64)
         if self.kind == "logit":
             off = CLOSEST * (self.upper - self.lower)

@@ -23,7 +23,7 @@ Arrays = Mapping[str, Array]
 def make_value(key: str, like: SceneValue, value: Value, base: Path) -> Array:
     """Convert a value of a job to an array.
 
-    A number fills all entries. A list is a colour, repeated over a texture, or all entries of a flat array. An image is
+    A number fills all entries. A list is the colour of all texels, or contains all entries of a flat array. An image is
     resampled to the size of the texture and converted to its channels. A volume is resampled to the size of the grid.
 
     Args:
@@ -69,7 +69,7 @@ def make_value(key: str, like: SceneValue, value: Value, base: Path) -> Array:
 
 
 def seen(params: mi.SceneParameters, key: str) -> SceneValue:
-    """Return the decoded value of a scene parameter, which is what jobs take, optimise and save (see `Form`)."""
+    """Return the decoded value of a scene parameter, the form in which jobs give, optimise and save it (see `Form`)."""
     return form_of(params, key).see(params[key])
 
 
@@ -77,10 +77,10 @@ def adapted_image(name: str, image: Image, other: str, channels: int) -> Image:
     """Convert an image to a number of channels.
 
     Args:
-        name: subject of the message if that fails.
+        name: name of the image in error messages.
         image: the image.
-        other: what needs the channels, as subject and verb for the message.
-        channels: number of channels.
+        other: subject and verb of the clause that names the required channels, as in "sensor 'a' renders".
+        channels: required number of channels.
 
     Raises:
         PathreplayError: the conversion is not defined, or the image is not finite.
@@ -93,7 +93,7 @@ def adapted_image(name: str, image: Image, other: str, channels: int) -> Image:
 
 
 def require_finite_array(name: str, array: Array) -> None:
-    """Raise PathreplayError if an entry is NaN or infinite; the message names the first one."""
+    """Raise PathreplayError if an entry is NaN or infinite, and name the first such entry in the message."""
     bad = ~np.isfinite(array)
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])

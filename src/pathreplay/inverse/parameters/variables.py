@@ -29,15 +29,15 @@ from pathreplay.scenes.parameters import SceneValue
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
 
 RESERVED = frozenset({EXPOSURE, "__metadata__"})
-"""Keys with a special meaning in files of values."""
+"""Keys with a special meaning in files of saved values. Parameters that have a ``shape`` cannot use them."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of the optimiser; all values are decoded.
+    """A variable of the optimiser. All its values are decoded (see `Form`).
 
-    Its key is the key of a scene parameter, the key of a pose followed by ':translation' or ':rotation', or the key of
-    an array from which scene parameters are derived.
+    The key of a variable is the key of a scene parameter, the key of a pose followed by ':translation' or ':rotation',
+    or the key of an array from which scene parameters are derived.
     """
 
     key: str
@@ -60,7 +60,7 @@ class Variable:
     """Conversion between decoded values and the values that Mitsuba stores."""
 
     def held(self, values: Array) -> dr.ArrayBase:
-        """Convert an array to Dr.Jit; the resolution of a grid may differ from its initial one."""
+        """Convert an array of values to Dr.Jit. The resolution of a grid may differ from the initial resolution."""
         return type(self.like)(values) if dr.is_tensor_v(self.like) else parameters.to_value(self.like, values)
 
 
@@ -79,7 +79,7 @@ def keys_of(
         integrator: integrator that must be able to differentiate the parameters.
 
     Returns:
-        The tables of the job by scene key: of recovered parameters, and of derived parameters.
+        Two dictionaries by scene key: the tables of the recovered parameters, and the tables of the derived parameters.
 
     Raises:
         PathreplayError: a parameter does not exist, is not differentiable, or is named twice.
@@ -128,7 +128,7 @@ def make_variables(
     starts: Mapping[str, Array] = MappingProxyType({}),
     limit_rates: bool = True,
 ) -> tuple[list[Variable], list[Pose]]:
-    """Make the variables and poses of a job; their true values are set later.
+    """Make the variables and poses of a job. Their true values are not set here.
 
     Args:
         scene: the scene.
@@ -137,8 +137,8 @@ def make_variables(
         base: folder that relative paths start from.
         modules: finder of user functions.
         starts: initial values by the key of a table, in place of its ``initial``.
-        limit_rates: whether learning rates are refused that are large for the range of values; the step of SGD
-            scales with the gradient, so its rate cannot be checked.
+        limit_rates: whether to refuse learning rates that are large for the range of values. Rates of SGD cannot be
+            checked, because the length of its steps is proportional to the gradient.
 
     Returns:
         The variables, and the poses that are computed from some of them.
@@ -176,7 +176,8 @@ def make_variables(
         for part, name in pose.parts().items():
             start = np.array(getattr(entry.displacement, part) or [0.0, 0.0, 0.0], np.float32)
             if part == "rotation":
-                # The job gives degrees; the general learning rate is in radians, which suits a scene of size 1.
+                # The job gives rotations in degrees. Its general learning rate applies to radians, which suits a scene
+                # of size 1.
                 start = np.radians(start)
                 degrees = entry.rotation_learning_rate
                 rate = rate if degrees is None else float(np.radians(degrees))
@@ -263,7 +264,7 @@ def _start(key: str, like: SceneValue, form: Form, entry: Parameter, base: Path,
     elif entry.initial is None:
         start = parameters.get_array(like)
     else:
-        assert not isinstance(entry.initial, Displacement)  # the schema allows that for poses only
+        assert not isinstance(entry.initial, Displacement)  # the schema allows these for poses only
         start = form.of_colours(key, make_value(key, like, entry.initial, base))
     for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
         if bound is not None and wrong(start, np.float32(bound)).any():

@@ -1,4 +1,4 @@
-"""Default integrators of a job, taken from the scene, and of its targets, taken from the job."""
+"""Default integrators of jobs, derived from the scene, and of rendered targets, derived from the job."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.types import Json
 
 SHOWN = {"max_depth": "the length of paths", "hide_emitters": "whether emitters are visible"}
-"""Options that change the expected image, and what each determines."""
+"""Options that change the expected image, with descriptions for messages."""
 
 
 def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None) -> tuple[Config, tuple[str, ...]]:
     """Fill in the integrators that a job leaves out.
 
     The default integrator of a job is `pathreplay` with the options of the scene's integrator. The default integrator
-    of rendered targets is `path`, or `volpath` for scenes with media, with the limits of the job's integrator.
+    of rendered targets is `path`, or `volpath` for scenes with media. Its path limits (`Limits`) are copied from the
+    job's integrator.
 
     Args:
         config: the job.
-        scene: its scene.
-        own: an integrator object that takes the place of the job's.
+        scene: scene of the job.
+        own: integrator object that takes the place of the job's integrator.
 
     Returns:
-        The completed job, and a note if targets are rendered with other limits than the job's.
+        The completed job, and a note if the integrators of job and targets have different limits.
 
     Raises:
         PathreplayError: an integrator cannot be created.
@@ -47,7 +48,7 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
 
 
 def _options(own: mi.Integrator | None) -> Json:
-    """Return the options of `pathreplay` that the scene's integrator implies; empty if it has none or no limits."""
+    """Return options of `pathreplay` that correspond to the scene's integrator; empty if its limits are unknown."""
     limits = None if own is None else read_limits(own)
     if own is None or limits is None:
         return {}

@@ -14,7 +14,7 @@ from pathreplay.inverse.losses.pixelwise import Loss, mean_loss
 
 
 def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Raise PathreplayError unless the scene has shapes, or all ``keys`` belong to emitters and sensors."""
+    """Raise PathreplayError if the scene has no shapes, and a key belongs to neither an emitter nor a sensor."""
     if scene.shapes():
         return
     visible = {
@@ -31,14 +31,14 @@ def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[
 def require_finite_loss(
     loss: Loss, name: str, target: Image, weight: Image | None, picture: Image | None = None
 ) -> None:
-    """Raise PathreplayError unless a loss and its derivative by the image are finite.
+    """Raise PathreplayError unless a loss and its derivative with respect to the image are finite.
 
     Args:
         loss: the loss function.
         name: name of the sensor, for messages.
         target: target image.
         weight: weights of the pixels, or None.
-        picture: rendered image; None for a black one.
+        picture: rendered image; None stands for a black image.
     """
     image = mi.TensorXf(np.zeros_like(target) if picture is None else picture)
     dr.enable_grad(image)

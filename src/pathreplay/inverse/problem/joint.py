@@ -15,7 +15,7 @@ from pathreplay.inverse.problem.problem import Problem
 
 @dataclass(frozen=True)
 class JointProblem(Problem):
-    """A problem of several scenes. Views are numbered across scenes, so that their random numbers are independent."""
+    """A problem of several scenes. Views are numbered across scenes, which makes their random numbers independent."""
 
     parts: tuple[Problem, ...] = ()
 
@@ -38,7 +38,7 @@ class JointProblem(Problem):
 
 
 def joined(parts: Sequence[Problem], config: Config) -> JointProblem:
-    """Combine problems.
+    """Combine problems into a joint problem.
 
     Args:
         parts: problems of different scenes; the first definition of a shared variable is used.

@@ -1,4 +1,4 @@
-"""The inverse problem: scene, variables with bounds, and views with targets; checked before the first iteration."""
+"""The inverse problem: scene, variables with bounds, and views with targets, checked before the first iteration."""
 
 from __future__ import annotations
 
@@ -67,12 +67,15 @@ class VariableCache:
         self._known: dict[str, tuple[weakref.ref[Array], dr.ArrayBase]] = {}
 
     def variables(self, problem: Problem, values: Arrays) -> dict[str, dr.ArrayBase]:
-        """Convert values as `variables_of`, without gradients; reuse the arrays if the values are the same objects."""
+        """Convert values as `variables_of` does, without gradients.
+
+        The arrays of the last call are reused if the values are the same objects.
+        """
         keys = [v.key for v in problem.variables]
         if any(key not in self._known or self._known[key][0]() is not values[key] for key in keys):
             self._known = {}  # release the old copies first
             converted = variables_of(problem, values)
-            # Weak references, because ids of freed arrays may be reused, and the cache must not keep arrays alive.
+            # Weak references do not keep arrays alive. Ids would not do, because ids of freed arrays may be reused.
             self._known = {key: (weakref.ref(values[key]), value) for key, value in converted.items()}
         variables = {key: self._known[key][1] for key in keys}
         dr.disable_grad(variables)
@@ -81,7 +84,7 @@ class VariableCache:
 
 @dataclass(frozen=True)
 class Problem:
-    """Minimise, over the variables, the mean over the views of loss(render(scene, view), target of the view)."""
+    """Minimise, over the variables, the mean of loss(render(scene, view), target of the view) over the views."""
 
     config: Config
     """The job with its default integrators filled in (see `completed`)."""
@@ -91,7 +94,9 @@ class Problem:
     baseline: mi.Integrator | None
     """Integrator that solves the same problem in the same time, for comparison."""
     judge: mi.Integrator
-    """Integrator of the images in which both are compared: that of the targets if they are rendered."""
+    """Integrator of the images by which ``integrator`` and ``baseline`` are compared.
+
+    Rendered targets use the same integrator."""
     variables: tuple[Variable, ...]
     poses: tuple[Pose, ...]
     views: tuple[View, ...]
@@ -108,7 +113,7 @@ class Problem:
 
     @contextmanager
     def computing(self) -> Iterator[None]:
-        """Context for evaluations: one thread in deterministic jobs, and errors of integrators as PathreplayError."""
+        """Return a context in which deterministic jobs use one thread, and integrators raise PathreplayError."""
         config = self.config
         names = "' or '".join(plugin.type for plugin in (config.integrator, config.baseline) if plugin is not None)
         with one_thread(config.deterministic), errors_as(f"Integrator '{names}' cannot do this job"):
@@ -126,7 +131,7 @@ class Problem:
         return {n for n, reached in enumerate(flags) if reached}
 
     def scenes(self) -> tuple[Problem, ...]:
-        """Return the problem, or the problems of all scenes of a joint problem."""
+        """Return the problems of all scenes of a joint problem, or this problem alone if it has a single scene."""
         return (self,)
 
     def home(self, view: View) -> tuple[Problem, View]:
@@ -144,7 +149,7 @@ class Problem:
 
 def variables_of(problem: Problem, values: Arrays) -> dict[str, dr.ArrayBase]:
     """Convert the decoded values of the variables to evaluated Dr.Jit arrays that own their memory."""
-    # Dr.Jit would wrap NumPy's memory, whose alignment varies and would force frozen functions to record again.
+    # Copy by a product. NumPy's memory has varying alignments, which would force frozen functions to record again.
     one = dr.opaque(mi.Float, 1)
     variables = {v.key: v.held(values[v.key]) * one for v in problem.variables}
     dr.eval(variables)
@@ -152,7 +157,7 @@ def variables_of(problem: Problem, values: Arrays) -> dict[str, dr.ArrayBase]:
 
 
 def scene_values(problem: Problem, variables: Mapping[str, dr.ArrayBase]) -> dict[str, SceneValue]:
-    """Compute the scene parameters in the form that Mitsuba stores; derivatives propagate to the variables.
+    """Compute the scene parameters in the form that Mitsuba stores. Derivatives propagate to the variables.
 
     Args:
         problem: the problem.
@@ -209,12 +214,12 @@ def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class InMemory:
-    """Objects that a problem is given in place of the files and plugins that a job names."""
+    """Objects that take the place of files and plugins that a job names."""
 
     scene: mi.Scene | None = None
     integrator: mi.Integrator | None = None
     functions: Mapping[str, Callable[..., object]] = field(default_factory=dict)
-    """Callables, by their names in the job."""
+    """User functions (losses, regularizers, derivations), by their names in the job."""
     starts: Mapping[str, Array] = field(default_factory=dict)
     """Initial values by key of the parameter, in place of its ``initial``."""
 
@@ -227,8 +232,8 @@ def build_problem(
     Args:
         config: the job.
         base: folder that relative paths start from.
-        targets: target images, if they exist already (of a resumed run, or arrays); None to read or render them.
-        memory: objects in place of files and plugins that the job would name.
+        targets: target images of a resumed run, or given as arrays; None to read or render the targets.
+        memory: objects that take the place of files and plugins of the job.
 
     Raises:
         PathreplayError: a part of the job is invalid or inconsistent.
@@ -253,7 +258,7 @@ def build_problem(
     baseline = None if config.baseline is None else _gradient_integrator(config.baseline)
     if baseline is not None:
         keys_of(params, config.parameters, config.derived, baseline)
-        _edges(params, keys, baseline)  # only to suppress its own warning; one note is enough
+        _edges(params, keys, baseline)  # only suppresses the baseline's own note, because one note is enough
     judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     # Cheap checks come before the rendering of targets.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
@@ -291,7 +296,7 @@ def build_problem(
     variables = tuple(_kept(disk, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in unsolved_poses)
     derived = tuple(replace(entry, truth=truth.get(entry.key)) for entry in derived)
-    # Traversed again: SceneParameters from which values were read expect all of their keys at the next update().
+    # Traverse again, because SceneParameters from which values were read expect all of their keys at the next update().
     params = traversed(scene)
     parameters.keep_only(params, keys)
     digest = fingerprint(used.values()) if used else None
@@ -303,7 +308,7 @@ def build_problem(
 def _loaded(
     config: Config, base: Path, shots: Mapping[str, Shot], given: InMemory
 ) -> tuple[mi.Scene, Config, tuple[str, ...]]:
-    """Load the scene and fill in the default integrators of the job; returns both, and notes for the user."""
+    """Load the scene and fill in default integrators. Returns scene, completed job, and notes for the user."""
     if given.scene is not None:
         config, differences = completed(config, given.scene, given.integrator)
         return given.scene, config, differences
@@ -328,7 +333,7 @@ class _Opened:
 def _seen(
     config: Config, targets: Targets | None, shots: Mapping[str, Shot], opened: _Opened, base: Path, disk: DiskStore
 ) -> tuple[Targets, dict[str, Array], tuple[str, ...]]:
-    """Read or render the targets unless they are given; returns them, true values by key, and notes for the user."""
+    """Read or render the targets if none are given. Returns targets, true values by key, and notes for the user."""
     truth: dict[str, Array] = {}
     notes: tuple[str, ...] = ()
     first = targets is None
@@ -357,7 +362,7 @@ def _kept(disk: DiskStore, variable: Variable) -> Variable:
 
 
 def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list[Variable]:
-    """Make the variable of the exposures, if the job has them."""
+    """Make the variable of the exposures. The list is empty if the job has no exposures."""
     if (options := config.exposure) is None:
         return []
     value = start_of_exposures(len(views), min(view.target.shape[2] for view in views), options.white_balance)
@@ -380,7 +385,7 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
 def _pictures(
     config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path, disk: DiskStore
 ) -> tuple[Targets, tuple[str, ...]]:
-    """Read the targets from the files of a capture, or from files that the job names; returns notes, too."""
+    """Read the targets from the files of a capture or of the job. Returns targets, and notes for the user."""
     how = Reading(config.target.alpha, hidden=bool((config.integrator.model_extra or {}).get("hide_emitters")))
     if config.capture is None:
         files = by_view("target images", config.target.images or [], sensors, base)
@@ -409,9 +414,9 @@ def _require_gradients(integrator: mi.Integrator, name: str) -> None:
 
 
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
-    """Return a note if visibility boundaries move: boundary terms are expensive, or the gradient lacks them.
+    """Return a note for the user if visibility boundaries move with the parameters, and suppress the integrator's note.
 
-    This also suppresses the integrator's own note.
+    The note says that boundary terms are expensive, or that the gradient lacks boundary terms.
     """
     moving = [key for key in keys if moves_edges(params, key)]
     known = stateful(integrator)
