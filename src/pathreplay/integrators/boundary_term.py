@@ -28,24 +28,26 @@ from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
 FILM_CLOSER, INNER_CLOSER = 5, 16
-"""Ratio of probed segments to segments that are resampled and resolved, on the film and in secondary searches."""
+"""Number of probed segments per resampled and bisected segment, on the film and in secondary searches."""
 GRID = "SDFGrid"
-"""Class of shapes whose silhouettes cannot be sampled: points near the outline are neither hit nor kept fixed."""
+"""Class of shapes whose silhouettes cannot be sampled: rays do not hit the points near the outline, and these points
+cannot be kept fixed on the surface."""
 BATCH = "BatchSensor"
-"""Class of sensors whose rays cannot be differentiated by film position: Dr.Jit terminates the process."""
+"""Class of sensors whose rays cannot be differentiated with respect to film position: Dr.Jit terminates the process."""
 FILM_LENGTH = 0.5  # length of segments on the film, in pixels
-INNER_LENGTHS = 0.25, 0.1  # of segments in the unit square of emitter samples, and of arcs in radians
+INNER_LENGTHS = 0.25, 0.1  # length of segments in the unit square of emitter samples; length of arcs in radians
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """The boundary term of edges seen by the camera (also through mirrors and glass) or by surfaces and particles.
+    """The boundary term of edges visible from the camera, from surfaces or from points in media.
 
-    Not differentiated: with media, hard shadows after the first scattering vertex; edges in textures and masks; alpha.
+    The camera may see an edge directly, in mirrors or through glass. Not differentiated: edges in textures and masks;
+    alpha; in scenes with media, hard shadows after the first scattering vertex.
     """
 
-    film: bool = True  # edges seen by the camera
-    inner: bool = True  # edges seen by surfaces and particles
+    film: bool = True  # edges visible from the camera
+    inner: bool = True  # edges visible from surfaces and points in media
     spp: int = 0  # segments per pixel, for each search; 0: as many as the samples of the pass
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
@@ -76,17 +78,20 @@ class Boundary:
         return TermResult(lost=lost.count, paths=paths, moves=True)
 
     def note(self, trace: TraceConfig) -> str:
-        """See `Term`: none."""
+        """Return "": this term has no notes."""
         return ""
 
     @staticmethod
     def move(view: Pass, trace: TraceConfig) -> bool:
-        """Return whether edges depend on parameters with gradients. Traces without evaluating anything."""
+        """Return whether edges depend on parameters with gradients. Computations are traced, but not evaluated."""
         return _move(trace, FilmPlaces.of(view))
 
     @staticmethod
     def informed(view: Pass, trace: TraceConfig) -> TraceConfig:
-        """Add the moving shapes to ``trace``. With media all may move, since paths cross moving null boundaries."""
+        """Add the moving shapes to ``trace``.
+
+        With media, all shapes are treated as moving, because paths cross null boundaries that may move.
+        """
         if trace.media is not None or trace.traits.moving is not None:
             return trace
         return replace(trace, traits=replace(trace.traits, moving=moving_shapes(trace.scene, _still_cameras(view))))
@@ -134,7 +139,7 @@ def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Return the static sensors: all except that of the pass, and also that one if a film flow contains its motion."""
+    """Return the sensors that count as static: all except the sensor of the pass, or all if it has a film flow."""
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 
 

@@ -1,4 +1,4 @@
-"""A pass: scene, sensor, seed and samples per pixel. Generates camera rays; its key identifies the pass."""
+"""A pass over an image: scene, sensor, seed and samples per pixel, from which the pass generates camera rays."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Rays:
     ray: mi.RayDifferential3f  # attached to the camera, if that has gradients
     weight: mi.Spectrum
     position: mi.Vector2f  # film position in pixels, where the sample is splatted
-    spp: int  # samples per pixel: that of the pass, as rounded by the sampler
+    spp: int  # samples per pixel of the pass, after rounding by the sampler
 
     @property
     def start(self) -> CameraStart:
@@ -73,10 +73,10 @@ class _PassSensor:
 
 @dataclass(frozen=True)
 class Pass:
-    """The inputs that determine the paths, besides the integrator's options. Generates the same rays in every call.
+    """The inputs that, together with the integrator's options, determine the paths of an image.
 
-    ``spp`` = 0 means the samples per pixel of the sensor's sampler. With ``uses_sobol``, Owen-scrambled Sobol samples
-    replace an `independent` sampler; other samplers are kept.
+    Every call of `rays` generates the same rays. ``spp`` = 0 means the samples per pixel of the sensor's sampler. With
+    ``uses_sobol``, Owen-scrambled Sobol samples replace an `independent` sampler; other samplers are kept.
     """
 
     scene: mi.Scene
@@ -85,11 +85,11 @@ class Pass:
     spp: int = 0
     share: float = 1.0  # weight in the mean over the parts of a split pass: see `parts`
     uses_sobol: bool = False
-    flow: FilmFlow | None = None  # motion of film positions; rays then carry only the rest of the motion
+    flow: FilmFlow | None = None  # motion of film positions; with a flow, rays carry only the rest of the motion
 
     @staticmethod
     def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, uses_sobol: bool = False) -> Pass:
-        """Create a pass from the arguments of Mitsuba's integrators; the sensor may be an index."""
+        """Create a pass from the arguments of a Mitsuba integrator; ``sensor`` is a sensor or its index."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         uses_sobol = uses_sobol and sensor.sampler().class_name() == "IndependentSampler"
         return Pass(scene, sensor, seed, spp or sensor.sampler().sample_count(), uses_sobol=uses_sobol)
@@ -132,7 +132,7 @@ class Pass:
         """
         bits = (paths - 1).bit_length()
         morton = morton_index(pixel % width, pixel // width)
-        # Bits of the index that exceed 32 bits select the set as well.
+        # The leading bits of an index that needs more than 32 bits also select the set.
         overflow = morton >> (32 - bits) if bits else mi.UInt32(0)
         return OwenSobolSampler.of((morton << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), overflow))
 
@@ -145,7 +145,7 @@ class Pass:
         return seed
 
     def pixel_samples(self, pixel: mi.UInt32) -> PixelSamples:
-        """Create the samples of lanes that each trace all paths of one pixel (row-major index)."""
+        """Create the samples for lanes that each trace all paths of one pixel; ``pixel`` is a row-major index."""
         if self.uses_sobol:
             width, _ = self.size
             return SobolSets(partial(self.sobol_sampler, pixel, width))
@@ -157,7 +157,8 @@ class Pass:
     def keys(self) -> tuple[tuple[int, int, int], ...]:
         """Keys that identify this pass among passes over the same scene: seed, samples per pixel and sensor.
 
-        Reads the seed, which synchronises if it is an array. Empty in a frozen function, which cannot read it.
+        Reading a seed that is an array synchronises with the device. The tuple is empty while `dr.freeze` records,
+        because a recorded function cannot read the seed.
         """
         if is_recording():
             return ()

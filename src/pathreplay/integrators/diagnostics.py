@@ -15,7 +15,7 @@ COST_OF_EDGES = (
     "their own, which may take several times as long as the rest: boundary = 'none' of the integrator leaves them out, "
     "boundary = 'primary' only edges that the camera does not see; see docs/boundary.md"
 )
-"""Message about the cost of boundary terms, if they were enabled by default."""
+"""Message about the cost of boundary terms that were enabled by default."""
 
 
 def lost_note(lost: int, paths: int) -> str:
@@ -67,7 +67,8 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
 def missing_edges(trace: TraceConfig, sensor: mi.Sensor, edges: str) -> tuple[str, bool]:
     """Format the message about moving edges whose boundary term is left out ("" if there is none to report).
 
-    ``edges`` are the estimated boundary terms. Also returns whether the message names the parameter that moves.
+    ``edges`` is the value of the property ``boundary``. Also returns whether the message names the parameter that
+    moves.
     """
     moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
     if moving:

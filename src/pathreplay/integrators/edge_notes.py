@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from pathreplay.scenes.parameters import needs_ray_adjoint
 
-# Parameters that move points of a surface. Mitsuba marks the others, for example B-spline controls, as discontinuous.
+# Parameters that move points of a surface. Mitsuba marks other parameters that do so as discontinuous.
 _POSITIONS = {"vertex_positions", "to_world", "control_points"}
 
 
@@ -34,7 +34,10 @@ def keys_that_move_edges(params: mi.SceneParameters) -> list[str]:
 
 
 def edges_note(keys: Iterable[str], edges: str = "none") -> str:
-    """Format the message about parameters that move edges, with the remedy; ``edges`` are the estimated terms."""
+    """Format the message about parameters that move edges, with the remedy.
+
+    ``edges`` is the value of the property ``boundary``.
+    """
     first, *others = keys
     more = f" (and {len(others)} more)" if others else ""
     if edges == "primary":

@@ -74,27 +74,35 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
 class PathReplayIntegrator(PathIntegrator):
     """Differentiable path tracer for surfaces and media.
 
-    Properties: ``max_depth`` (6; -1 = unbounded, with ``adjoint='replay'``), ``rr_depth`` (5), ``hide_emitters``
-    (False), ``adjoint`` (``auto``, ``recorded``, ``replay``: the reverse-mode method), ``attach`` (``delta``, ``all``,
-    ``none``: see `TraceConfig`), ``jacobian_noise`` (0.01: standard deviation of the perturbation of ray Jacobians in
-    replay, see `Recovery`), ``null_branching`` (``auto``, True, False), ``boundary`` (``auto``, ``none``, ``primary``,
-    ``all``: see `Boundary`), ``boundary_spp`` (segments per pixel; 0: as many as the samples of the pass) and
-    ``sampling`` (``sobol``: `OwenSobolSampler` in place of an independent sampler; ``scene``: the scene's own sampler).
-    ``adjoint = 'auto'`` records paths, with two exceptions: if ``max_depth`` exceeds the capacity of a record, it
-    replays them, and if only emitters have gradients, it uses `emission_only`. Forward mode ignores ``adjoint``.
+    Properties, with the default first:
+
+    - ``max_depth``: 6; -1 is unbounded, which requires ``adjoint='replay'``.
+    - ``rr_depth``: 5.
+    - ``hide_emitters``: False.
+    - ``adjoint``: ``auto``, ``recorded`` or ``replay``, the reverse-mode method. ``auto`` records paths. If
+      ``max_depth`` exceeds the capacity of a record, ``auto`` replays them. If only emitters have gradients, ``auto``
+      uses `emission_only`. Forward mode ignores this property.
+    - ``attach``: ``delta``, ``all`` or ``none``, see `TraceConfig`.
+    - ``jacobian_noise``: 0.01, standard deviation of the perturbation of ray Jacobians in replay, see `Recovery`.
+    - ``null_branching``: ``auto``, True or False, see below.
+    - ``boundary``: ``auto``, ``none``, ``primary`` or ``all``, see below and `Boundary`.
+    - ``boundary_spp``: 0, segments per pixel; 0 means as many as the samples of the pass.
+    - ``sampling``: ``sobol`` replaces an independent sampler by `OwenSobolSampler`; ``scene`` keeps it.
 
     ``boundary = 'auto'`` means ``all`` if something that can occlude light moves (see `edges_move`) and its boundary
-    term can be computed. Otherwise it means ``none``: with an ``attach`` other than ``delta``, and, with a message, for
-    sensors of type ``batch``. Without motion, no value of ``boundary`` causes a boundary term to be computed.
+    term can be computed, otherwise ``none``. The term cannot be computed with an ``attach`` other than ``delta``, for
+    sensors of type ``batch``, and in scenes with an ``sdfgrid``; the last two cases are logged. Without motion, no
+    boundary term is computed for any value of ``boundary``.
 
-    Gradients of media use a control variate that this integrator learns from earlier gradient passes (with other
-    seeds). ``null_branching`` traces one more path from a null collision, where the medium could have scattered.
-    Without it, the gradient with respect to extinction is wrong where extinction is zero. ``auto`` branches if
-    extinction with gradients varies in space or is zero; at equal noise this usually takes less time as well.
+    Gradients of media use a control variate that this integrator learns from earlier gradient passes with other seeds.
+    ``null_branching`` traces one more path from a null collision, as if the medium had scattered there. Without null
+    branching, the gradient with respect to extinction is wrong where extinction is zero. ``auto`` branches if
+    extinction with gradients varies in space or is zero. In these cases, branching usually also takes less time at
+    equal noise.
 
-    Not differentiated: visibility that ``boundary`` leaves out; all motion of shapes, cameras and directions with
-    ``attach='none'``; extinction where it is zero without ``null_branching``; weights that are exactly zero with
-    ``adjoint='replay'``.
+    Not differentiated: visibility that ``boundary`` leaves out; with ``attach='none'``, all motion of shapes, cameras
+    and directions; without ``null_branching``, extinction where it is zero; with ``adjoint='replay'``, weights that are
+    exactly zero.
     Raises PathreplayError for unknown or unusable properties and in polarised variants.
     """
 
@@ -129,10 +137,10 @@ class PathReplayIntegrator(PathIntegrator):
         return self.interior, Boundary(inner=self.boundary != "primary", spp=self.boundary_spp)
 
     def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
-        """See `PathIntegrator`. Adds the film's flow and its term; the other terms then differentiate the rest.
+        """Add the film flow and its term; the other terms then differentiate the rest of the motion.
 
-        If ``follow``, the flow may follow visible surfaces (`SurfaceFlow`). Leaves out the boundary term if no edge
-        moves or ``auto`` cannot compute it. Leaves out the interior as well if the flow is the whole derivative.
+        If ``follow``, the flow may follow visible surfaces (`SurfaceFlow`). The boundary term is left out if no edge
+        moves or ``auto`` cannot compute it. The interior term is left out if the flow contains the whole derivative.
         """
         view, trace, terms = PathIntegrator._planned(self, view, state)
         if self.boundary == "none":
@@ -152,7 +160,7 @@ class PathReplayIntegrator(PathIntegrator):
         return view, replace(trace, may_slide=self.boundary != "primary" and trace.media is None), (*terms, *motion)
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
-        """Return whether film positions may follow visible surfaces: all edges that then move can be sampled."""
+        """Return whether film positions may follow visible surfaces, which requires that all edges can be sampled."""
         return self.boundary != "primary" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
 
     def _needs_edges(self, view: Pass, trace: TraceConfig) -> bool:
@@ -167,7 +175,7 @@ class PathReplayIntegrator(PathIntegrator):
         return not why
 
     def is_recordable(self, has_media: bool) -> bool:
-        """See `StatefulIntegrator`: always true, since rendering reads no results on the host."""
+        """Return True, because rendering reads no results on the host."""
         return True
 
     def supports_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
@@ -204,13 +212,26 @@ class PathReplayIntegrator(PathIntegrator):
     ) -> mi.TensorXf:
         """Render an image and back-propagate a loss with derivative offset + slope · image, in one pass.
 
-        ``offset`` and ``slope`` have the shape of the image, height x width x 3. ``pixels`` are distinct row-major
-        indices of n pixels. If given, only these pixels are rendered and contribute to the loss; ``offset``, ``slope``
-        and the returned image then have the shape n x 1 x 3. The interior term evaluates the loss derivative of a path
-        from the other sample sets of its pixel (see `pixel_sweep`), and the boundary term from the image. For what is
-        not differentiated, see `sweep`. Warns like `render_backward`. Requires `supports_pixel_sweep`. Raises
-        PathreplayError for an unsuitable number of samples, a wrong tensor shape, repeated or invalid pixels, or if no
-        parameter with gradients reaches the paths.
+        The interior term evaluates the loss derivative of a path from the other sample sets of its pixel (see
+        `pixel_sweep`). The boundary term evaluates the loss derivative from the image. For what is not differentiated,
+        see `sweep`. Warns like `render_backward`. Requires `supports_pixel_sweep`.
+
+        Args:
+            scene: the scene, without media.
+            offset: constant part of the loss derivative, in the shape of the returned image.
+            slope: linear part of the loss derivative, in the shape of the returned image.
+            sensor: a sensor, or its index in the scene.
+            seed: seed of the random numbers.
+            spp: samples per pixel; 0 means those of the sensor's sampler.
+            pixels: distinct row-major indices of n pixels. If given, only these pixels are rendered and contribute to
+                the loss.
+
+        Returns:
+            The image, height x width x 3, or n x 1 x 3 with ``pixels``.
+
+        Raises:
+            PathreplayError: an unsuitable number of samples, a wrong tensor shape, repeated or invalid pixels, or no
+                parameter with gradients that reaches the paths.
         """
         view = self.pass_of(scene, sensor, seed, spp)
         image, state = self.pixel_pass(view, (offset, slope), pixels, self.begin(scene))
@@ -244,7 +265,10 @@ class PathReplayIntegrator(PathIntegrator):
         return result.image, state.after(result)
 
     def begin(self, scene: mi.Scene) -> PassState:
-        """See `PathIntegrator`. Adds the control variate of media, except in a user's recording, which cannot learn."""
+        """Create the state of a pass, with the control variate of media.
+
+        A user's recording by `dr.freeze` cannot learn, and gets no control variate.
+        """
         state = PathIntegrator.begin(self, scene)
         if not state.is_complete or not facts_of(scene).has_media:
             return state
@@ -252,7 +276,7 @@ class PathReplayIntegrator(PathIntegrator):
         return replace(state, guess=learned.guess, passes=learned.passes)
 
     def keep(self, scene: mi.Scene, state: PassState) -> None:
-        """See `PathIntegrator`. Does nothing in a user's recording, which cannot read results."""
+        """Log lost paths, and learn from the results. Does nothing in a user's recording, which cannot read results."""
         if is_recording():
             return
         result = state.result
@@ -263,13 +287,16 @@ class PathReplayIntegrator(PathIntegrator):
             self.baseline = ref(facts_of(scene)), learned if result.stats is None else learned.after(result.stats)
 
     def _baseline_state(self, scene: mi.Scene) -> BaselineState:
-        """Return the learned state for a scene; a fresh one unless the last gradient pass was over the same scene."""
+        """Return the state learned from a scene, or a fresh state if the last gradient pass was over another scene."""
         if self.baseline is None or self.baseline[0]() is not facts_of(scene):
             return BaselineState.fresh(scene.bbox())
         return self.baseline[1]
 
     def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:
-        """See `PathIntegrator`. A pass never uses a control variate that it contributed to, which would bias it."""
+        """Log doubts about the gradient, and return the control variate, if the pass may use it.
+
+        A pass never uses a control variate that it contributed to, because this would bias its gradient.
+        """
         for doubt in filter(None, (*doubts(trace), *(term.note(trace) for term in self.terms))):
             self._warn_once(doubt)
         if trace.media is None or state.guess is None:
@@ -284,7 +311,10 @@ class PathReplayIntegrator(PathIntegrator):
         return {} if self.baseline is None else self.baseline[1].state_dict()
 
     def load_state_dict(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
-        """Restore a `state_dict` of the same scene; an empty one resets it. Raises PathreplayError if invalid."""
+        """Restore a `state_dict` of the same scene; an empty dictionary resets the learned state.
+
+        Raises PathreplayError for an invalid dictionary.
+        """
         box = scene.bbox()
         baseline = BaselineState.restored(box, learned) if learned else BaselineState.fresh(box)
         self.baseline = ref(facts_of(scene)), baseline

@@ -1,4 +1,4 @@
-"""The interior term: derivative of path contributions at fixed visibility, computed by a driver of camera paths."""
+"""The interior term: derivative of path contributions at fixed visibility. A driver traces and differentiates paths."""
 
 from __future__ import annotations
 
@@ -34,36 +34,43 @@ def image(view: Pass, trace: TraceConfig) -> mi.TensorXf:
 
 
 def tangent(view: Pass, trace: TraceConfig, driver: ForwardDriver) -> TermResult:
-    """Compute the tangent of the image with a driver. Counts lost paths if paths move with the parameters."""
+    """Compute the tangent of the image with a driver.
+
+    If paths move with the parameters, also count the paths that lose a part of their gradient.
+    """
     rays, lost = view.rays(), NonFiniteCounter()
     δL, valid, moves = driver(trace, rays.start, lost)
     image = splat(view, rays, δL, valid)
     if not moves:
         return TermResult(image)
-    dr.eval(image)  # the same kernel counts lost paths
+    dr.eval(image)  # the kernel of the image also counts the lost paths
     return TermResult(image, lost=lost.count, paths=dr.width(rays.ray), moves=True)
 
 
 def back_propagate(view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, driver: Driver) -> TermResult:
-    """Back-propagate the adjoint of the image with a driver. Counts lost paths if paths move, or with media."""
+    """Back-propagate the adjoint of the image with a driver.
+
+    If paths move or the scene has media, also count the paths that lose a part of their gradient.
+    """
     rays, lost = view.rays(), NonFiniteCounter()
     δL, paths = adjoint(view, rays, grad_in), dr.width(rays.ray)
     moves = driver(trace, rays.start, δL, lost)
-    del rays, δL  # unreferenced loop outputs need not be computed
+    del rays, δL  # Dr.Jit does not compute loop outputs without references
     dr.eval()
     return TermResult(lost=lost.count, paths=paths, moves=moves) if moves or trace.media is not None else TermResult()
 
 
 @dataclass(frozen=True)
 class PathReplay:
-    """The interior term by `forward` and, in reverse mode, by `sweep`, `replay` or `emission_only`.
+    """The interior term: `forward` in forward mode, and `sweep`, `replay` or `emission_only` in reverse mode.
 
-    Not differentiated: see `sweep`, `replay` and `forward`; weights that are exactly zero with `replay`.
+    For what is not differentiated, see these functions. `replay` also does not differentiate weights that are exactly
+    zero.
     """
 
     adjoint: str  # recorded (`sweep`) or replay
     auto: bool  # allows `replay` for paths too deep for a record, and `emission_only` if only emitters have gradients
-    branch: str | bool  # whether one null collision per path is kept (auto: if it is needed)
+    branch: str | bool  # whether each path branches at one null collision (auto: if the media require it)
     recovery: Recovery  # regularisation of `replay`
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
@@ -81,7 +88,7 @@ class PathReplay:
         return replace(result, stats=stats)
 
     def pixels(self, view: Pass, trace: TraceConfig, loss: PixelLoss, some: mi.UInt32 | None) -> TermResult:
-        """Render the image and back-propagate the loss in one pass: see `pixel_sweep`. For scenes without media.
+        """Render the image and back-propagate the loss in one pass: see `pixel_sweep`. The scene must have no media.
 
         With ``some`` (row-major pixel indices), the image has one row per pixel.
         """
@@ -90,7 +97,7 @@ class PathReplay:
         lanes = dr.width(pixel)
         samples, camera = view.pixel_samples(pixel), pixel_camera(view.sensor, pixel)
         moves, L = pixel_sweep(trace, samples, camera, view.spp, loss, lost)
-        dr.eval(L)  # the same kernel computes the gradients
+        dr.eval(L)  # the kernel of L also computes the gradients
         image = mi.TensorXf(dr.ravel(L), (height, width, 3) if some is None else (lanes, 1, 3))
         return TermResult(image, lost=lost.count, paths=lanes * view.spp, moves=True) if moves else TermResult(image)
 
@@ -99,7 +106,7 @@ class PathReplay:
         return lights_or(driver) if self.auto else driver
 
     def note(self, trace: TraceConfig) -> str:
-        """See `Term`: a message if records do not fit into GPU memory, so that paths are replayed."""
+        """Return a message if paths are replayed because records do not fit into GPU memory, otherwise ""."""
         device = device_of(mi.variant())
         if self._sweeps(trace) or self.adjoint == "replay" or not device.is_gpu:
             return ""

@@ -8,10 +8,10 @@ including the objects of other scenes. Four rules follow, which this module enfo
    released once nothing else references the scene. (`nodes` ensures that traversals leave no reference cycles.)
 2. No object is created or freed between two virtual function calls of one kernel. Otherwise Dr.Jit emits the same
    function twice ("invalid redefinition"). The cyclic garbage collector is therefore off during a pass, and scenes are
-   released before it.
+   released before the pass.
 3. No scene is freed while `dr.freeze` records. Freeing a scene launches a host function, which cannot be recorded and
-   crashes the process. Nothing is therefore released then, and objects that may have become garbage are hidden from the
-   collector until the recording has ended.
+   crashes the process. No scene is therefore released during a recording, and objects that may have become garbage are
+   hidden from the collector until the recording has ended.
 4. Only one Python thread renders at a time. All threads of a process share Dr.Jit's registry and memory. Threads that
    trace or launch kernels concurrently get wrong results or crash the process. A pass therefore raises an error if
    another thread has one in progress; `exclusive` lets threads take turns.
@@ -42,11 +42,11 @@ class _Entry(Generic[T]):
 
     scene: mi.Scene
     about: T
-    held_once: object = field(default_factory=object)  # its reference count equals that of an unreferenced scene
+    held_once: object = field(default_factory=object)  # has the reference count of a scene without other references
 
     @property
     def is_unreferenced(self) -> bool:
-        """Whether nothing else references the scene. The count includes Mitsuba's own references to an object."""
+        """Whether only this entry references the scene. Python's count includes Mitsuba's references to the scene."""
         return sys.getrefcount(self.scene) <= sys.getrefcount(self.held_once)
 
 

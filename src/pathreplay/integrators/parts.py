@@ -1,8 +1,8 @@
-"""Split a pass of many samples into passes with their own seeds; the result is their mean, weighted by samples.
+"""Split a pass of many samples into parts with their own seeds, and average the parts, weighted by their samples.
 
 Dr.Jit counts the samples of a kernel in 32 bits, but single precision limits sums much earlier. A sum of n equal
-numbers, added one by one, has a relative error of up to n 2^-25, and stops growing at n = 2^24. Dr.Jit adds packets of
-16 samples first. Apart from that, samples are added one by one, both to a pixel and to the gradient of a scalar.
+numbers, added one by one, has a relative error of up to n 2^-25, and stops growing at n = 2^24. Dr.Jit first sums
+packets of 16 samples. The packets are then added one by one, both to a pixel and to the gradient of a scalar.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from pathreplay.scenes.parameters import SceneValue, is_transform
 # Largest number of samples of a pass that is not split. The relative error of a scalar's gradient is then below 1e-2 if
 # all samples contribute equally, and far below its noise otherwise.
 MOST_AT_ONCE = 2**24
-# Samples of a part of a split pass: the relative error is 1.3e-3, and a part takes a few tenths of a second, so that
-# the cost of tracing its kernel again is negligible.
+# Samples of a part of a split pass. The relative error is 1.3e-3. A part takes a few tenths of a second, compared with
+# which the cost of tracing its kernel again is negligible.
 A_PART = 2**22
-# Largest number of samples per pixel in one pass or part: a pixel of constant colour has a relative error of 7e-4.
+# Largest number of samples per pixel in one pass or part. At this number, a pixel of constant colour has a relative
+# error of 7e-4.
 MOST_A_PIXEL = 2**16
 # Smallest number of samples per pixel in a part with many pixels: with fewer, the work on the film would be noticeable.
 LEAST_A_PIXEL = 4
-# Largest number of samples of one call, which shows no progress and cannot be interrupted: minutes on current machines.
+# Largest number of samples of one call: minutes on current machines. Calls show no progress and cannot be interrupted.
 MOST_IN_ALL = 2**36
 
 
@@ -39,7 +40,7 @@ def parts(view: Pass) -> list[Pass]:
     """Split a pass of many samples into parts with weights ``share``; the first part keeps the seed.
 
     Returns the pass itself if it needs no split.
-    Raises PathreplayError if Dr.Jit cannot count one sample per pixel, or if all samples would take hours.
+    Raises PathreplayError if Dr.Jit cannot count one sample per pixel, or for more than `MOST_IN_ALL` samples.
     """
     width, height = film_size(view.sensor)
     pixels = width * height
@@ -107,10 +108,10 @@ def _arrays(value: SceneValue) -> list[dr.ArrayBase]:
 
 
 def split(sampler: mi.Sampler, spp: int, most: int) -> list[int]:
-    """Return the samples per pixel of each part, about ``most``. Their sum is ``spp``, or more if the sampler rounds.
+    """Return the samples per pixel of each part, at most ``most``.
 
-    Samplers other than `independent` stratify the samples of a pixel. For these, the size of a part is a power of four,
-    which every sampler accepts.
+    For an `independent` sampler, the counts add up to ``spp``. Other samplers stratify the samples of a pixel. Their
+    counts are powers of four, which every sampler accepts, and may add up to more than ``spp``.
     """
     if spp <= most:
         return [spp]

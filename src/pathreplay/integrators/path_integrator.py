@@ -37,7 +37,7 @@ UNBOUNDED = 0xFFFFFFFF
 
 
 def _sum(total: mi.TensorXf | None, image: mi.TensorXf, share: float) -> mi.TensorXf:
-    """Add a weighted image of a split pass to the sum, evaluated before the next pass begins."""
+    """Add the weighted image of a part of a pass to ``total``, and evaluate the sum before the next part begins."""
     if share == 1:
         return image
     total = image * share if total is None else total + image * share
@@ -49,8 +49,8 @@ def _sum(total: mi.TensorXf | None, image: mi.TensorXf, share: float) -> mi.Tens
 def reached(scene: mi.Scene, sensor: Which, zero_is_error: bool = False) -> Iterator[None]:
     """Context of a gradient pass: explain `Unreached` errors, and suppress them if the gradient is zero by design.
 
-    The gradient is zero by design if only other cameras have gradients (see `unreached_note`). With ``zero_is_error``
-    that case raises as well.
+    The gradient is zero by design if only other cameras have gradients (see `unreached_note`). With ``zero_is_error``,
+    the error is raised in this case, too.
     """
     try:
         yield
@@ -61,7 +61,7 @@ def reached(scene: mi.Scene, sensor: Which, zero_is_error: bool = False) -> Iter
 
 
 class PathIntegrator:
-    """Template of an integrator (see `on_base`), the base of all integrators of this package.
+    """Base of all integrators of this package: a template that `on_base` combines with Mitsuba's base class.
 
     Properties: ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
     Subclasses define ``name`` (of the plugin), ``attach`` (see `TraceConfig`) and the term ``interior``. Raises
@@ -87,14 +87,14 @@ class PathIntegrator:
                 f"{self.name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
                 f"use {mi.variant().replace('_polarized', '')!r}"
             )
-        # Mitsuba reads all three as well, but validates less.
+        # Mitsuba reads these three properties as well, but validates less.
         whole_number(props, self.name, "max_depth", 6, lowest=0, unbounded=True)
         whole_number(props, self.name, "rr_depth", 5, lowest=1)
         hide_emitters = flag(props, self.name, "hide_emitters", False)
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
         self.warned: set[str] = set()  # notes that were logged or silenced
-        self.tables: Tables | None = None  # of the last rendered scene; a recording by a user's `dr.freeze` uses them
+        self.tables: Tables | None = None  # tables of the last rendered scene, for recordings by a user's `dr.freeze`
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -146,7 +146,8 @@ class PathIntegrator:
         """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
 
         Warns if a part of the gradient was not finite and was left out, or if moving edges are not differentiated.
-        Raises PathreplayError if no parameter with gradients reaches the paths, unless all belong to other cameras.
+        Raises PathreplayError if no parameter with gradients reaches the paths, unless all parameters with gradients
+        belong to other cameras.
         """
         passes = parts(self.pass_of(scene, sensor, seed, spp))
         with summed(scene, passes) as add_up:
@@ -201,7 +202,7 @@ class PathIntegrator:
     def begin(self, scene: mi.Scene) -> PassState:
         """Create the state of a pass over a scene.
 
-        In a recording by a user's `dr.freeze` it contains only tables: media cannot be inspected there.
+        In a recording by a user's `dr.freeze`, the state contains only tables, because media cannot be inspected.
         """
         with careful():
             facts = facts_of(scene)
@@ -244,7 +245,7 @@ class PathIntegrator:
             yield
 
     def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
-        """Build the trace configuration; ``sensor`` may be inside a medium. Default ``state``: a new one."""
+        """Build the trace configuration; ``sensor`` may be inside a medium. ``state`` None means a new state."""
         facts, state = facts_of(scene), PathIntegrator.begin(self, scene) if state is None else state
         return TraceConfig(
             scene=scene,
@@ -258,9 +259,9 @@ class PathIntegrator:
         )
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
-        """Return whether a parameter with gradients reaches the paths of a sensor; with media, this is assumed.
+        """Return whether a parameter with gradients reaches the paths of a sensor. With media, the result is True.
 
-        Traces one step and evaluates nothing.
+        One step of the paths is traced, but not evaluated.
         """
         view = Pass.of(scene, sensor, 0, 1)
         with self._pass_context():
@@ -271,7 +272,7 @@ class PathIntegrator:
             return path_moves(trace, start, at) or weights_vary(trace, at)
 
     def is_recordable(self, has_media: bool) -> bool:
-        """See `StatefulIntegrator`."""
+        """Return False: see `StatefulIntegrator`."""
         return False
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
@@ -281,11 +282,11 @@ class PathIntegrator:
     def pixel_pass(
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]:
-        """Raise PathreplayError: not available."""
+        """Raise PathreplayError, because this integrator has no pixel sweep."""
         raise PathreplayError(self.why_no_pixel_sweep(view.scene))
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Return the learned state: none."""
+        """Return an empty dictionary, because nothing is learned."""
         return {}
 
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None:
@@ -293,7 +294,7 @@ class PathIntegrator:
         require_nothing_learned(learned)
 
     def options(self) -> Json:
-        """See `StatefulIntegrator`."""
+        """Return no properties: see `StatefulIntegrator`."""
         return {}
 
     def silence(self, notes: Iterable[str]) -> None:

@@ -1,4 +1,4 @@
-"""Path limits of an integrator, on which its image depends: path length, and visibility of emitters to the camera."""
+"""Read the path length, the depth of Russian roulette and the visibility of emitters from any integrator."""
 
 from __future__ import annotations
 

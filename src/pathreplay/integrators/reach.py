@@ -1,4 +1,4 @@
-"""Sensors whose images depend on a parameter: all, unless the parameter belongs to certain sensors only."""
+"""Sensors whose images depend on a parameter: all sensors, unless the parameter belongs only to certain sensors."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def attached_keys(params: mi.SceneParameters) -> list[str]:
 
 
 def unreached_note(scene: mi.Scene, sensor: mi.Sensor) -> str:
-    """Format the message that no parameter with gradients reaches the paths of a sensor; "" if that is expected.
+    """Format the message that no parameter with gradients reaches the paths of a sensor.
 
-    It is expected if all parameters with gradients belong to other cameras: their gradient in this image is zero.
+    Returns "" if all parameters with gradients belong to other cameras: their gradient in this image is zero.
     """
     params = mi.traverse(scene)
     keys = attached_keys(params)

@@ -25,7 +25,7 @@ from pathreplay.transport.volume.media import Media, scene_media, wants_branch
 
 
 class SceneFacts:
-    """Facts about one scene. They keep its objects alive, so that no other object can reuse their addresses."""
+    """Facts about one scene. References to the scene's objects prevent other objects from reusing their addresses."""
 
     def __init__(self, scene: mi.Scene) -> None:
         nodes = nodes_of(scene)
@@ -57,13 +57,13 @@ class SceneFacts:
 
     @property
     def has_seams(self) -> bool:
-        """Whether a texture has discontinuities. A recording assumes so unless it was determined before."""
+        """Whether a texture has discontinuities. A recording assumes so unless an earlier pass has determined it."""
         if self._seams is None and not is_recording():
             self._seams = has_seams(self._textures)
         return self._seams is not False
 
     def media(self, sensor: mi.Sensor | None, branches: bool | None = None) -> Media | None:
-        """Return the current media of the scene; ``sensor`` (or None) may be inside one."""
+        """Return the current media of the scene. ``sensor`` may be inside a medium."""
         return scene_media(self._media, self._traits.veils, sensor, branches)
 
     def constants(self) -> tuple[object, ...]:
@@ -75,7 +75,7 @@ class SceneFacts:
         return wants_branch(self._media)
 
     def traits(self, tables: Tables | None = None) -> Traits:
-        """Return the current traits, with these ``tables`` (default: `tables`)."""
+        """Return the current traits, with the given ``tables`` or, by default, the current tables."""
         return replace(
             self._traits,
             tables=self.tables() if tables is None else tables,
@@ -118,7 +118,7 @@ def _sizes(shapes: list[mi.Shape]) -> list[tuple[int, int]]:
 
 
 def _replaceable(scene: mi.Scene) -> list[mi.Object]:
-    """Return the objects that identify a scene, and all objects that can be replaced in it."""
+    """Return the sensors, emitters, shapes and BSDFs, which identify a scene and can be replaced in it."""
     shapes = scene.shapes()
     return [*scene.sensors(), *scene.emitters(), *shapes, *(shape.bsdf() for shape in shapes)]
 

@@ -124,7 +124,7 @@ class Stateless:
     def pixel_pass(
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]:
-        """Raise PathreplayError: not available."""
+        """Raise PathreplayError, because Mitsuba's integrators have no pixel sweep."""
         raise PathreplayError(no_pixel_sweep(self.name))
 
     @property
@@ -152,7 +152,7 @@ def no_pixel_sweep(name: str) -> str:
 
 
 def require_nothing_learned(learned: Learned) -> None:
-    """Raise PathreplayError if an integrator without learned state is given one."""
+    """Raise PathreplayError if ``learned`` is not empty, for integrators that cannot learn."""
     if learned:
         raise PathreplayError(
             "The checkpoint contains state that another integrator learned from media; set the config's 'integrator' "

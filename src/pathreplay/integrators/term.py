@@ -39,7 +39,7 @@ class Term(Protocol):
     """
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Return the contribution to the tangent of the image. The parameters carry their tangents already."""
+        """Return the contribution to the tangent of the image. The parameters must already carry their tangents."""
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         """Back-propagate the adjoint of the image into the parameters. On return, all kernels have been launched."""

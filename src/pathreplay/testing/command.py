@@ -53,7 +53,7 @@ def check_all(
 
 @contextmanager
 def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a transient progress bar on standard error, or occasional lines if that is not a terminal."""
+    """Show a transient progress bar on standard error, or occasional lines if standard error is not a terminal."""
     console = Console(stderr=True, force_jupyter=False)
     if console.is_terminal:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -103,7 +103,7 @@ def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
 
 
 def _with_error(value: float, error: float) -> str:
-    """Format a value and its error, '+0.03199 ± 0.00015': the error has two digits, the value as many decimals."""
+    """Format a value and its error as in '+0.03199 ± 0.00015', the error with two digits, both with equal decimals."""
     if not (math.isfinite(value) and math.isfinite(error)):
         return f"{value:+.4g}"
     if error == 0:

@@ -1,8 +1,9 @@
 """The line in parameter space along which a gradient is checked.
 
 A gradient with respect to a thousand texels is checked through one number, its dot product with a direction. The
-direction is random, so that no specific error can remain hidden. All its entries have the same sign, so that their
-contributions add up. Random signs would reduce the derivative by the square root of their number, but not its noise.
+direction is random, so that no specific error can remain hidden. All entries of the direction have the same sign, so
+that their contributions add up. Random signs would divide the derivative by the square root of the number of entries,
+without reducing the noise.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from pathreplay.scenes.spectra import coefficients, values_of_p
 from pathreplay.testing.stencil import BACKWARD, CENTRAL, FORWARD, Stencil
 
 RELATIVE_STEP = 1e-2
-"""Step h relative to the size of the parameter: truncation error (h² after division) near 1e-4, float32 rounding of
-images near 1e-5."""
+"""Step h relative to the size of the parameter. The truncation error, h², is near 1e-4, and the float32 rounding error
+of images is near 1e-5."""
 
-# Parameters whose sign has no meaning. All others that are nowhere negative are treated as bounded by 0.
+# Parameters that may be negative. All other parameters without negative entries are treated as bounded by 0.
 _SIGNED = ("vertex_positions", "vertex_normals", "vertex_texcoords", "to_world", "to_uv", "position", "direction")
 
 
@@ -39,7 +40,7 @@ class Line:
     stencil: Stencil
 
     def move(self, value: SceneValue, t: mi.Float) -> SceneValue:
-        """Return the point at t, computed from the parameter's own ``value`` and of the same type."""
+        """Return the point at t, computed from the parameter's ``value`` and of the same type as the value."""
         return displaced(value, self.direction, t)
 
 
@@ -55,11 +56,11 @@ def choose_line(
 ) -> Line:
     """Choose the line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
 
-    By default the largest change of an entry is a hundredth of the parameter's size. If this would make a non-negative
-    parameter negative (a black texel), the differences are one-sided, because a negative roughness or density is
-    invalid. Transforms are translated randomly. Infinitely ``far``
-    emitters (sun, sky), which translation does not change, are rotated about a random axis. Coefficients of ``spectra``
-    move such that the decoded values change by such steps: see :mod:`pathreplay.scenes.spectra`.
+    By default, the largest change of an entry is a hundredth of the parameter's size. If such a step would make a
+    non-negative parameter negative, for example a black texel, the differences are one-sided: a negative roughness or
+    density is invalid. The random direction of a transform is a translation. Infinitely ``far`` emitters (sun, sky) are
+    rotated about a random axis instead, because translation does not change them. For coefficients of ``spectra``, the
+    steps apply to the decoded values: see :mod:`pathreplay.scenes.spectra`.
 
     Raises PathreplayError for a direction that has another shape, is zero or not finite, and for a step that is not a
     positive number, or is too long or too short for the parameter.
@@ -77,7 +78,7 @@ def choose_line(
             raise PathreplayError(f"Direction for '{key}' is zero, NaN or infinite; give finite numbers, not all zero")
     else:
         v, description = _random_direction(value, transform, far, spectra, seed)
-    # Black is p = -8192; such texels must not determine the step of the others.
+    # A black texel has p = -8192, which must not determine the step of the other texels.
     size = 1.0 if spectra else max(1.0, float(np.abs(value[v != 0]).max()))
     if step is None:
         step = RELATIVE_STEP * size / ((float(np.abs(values_of_p(v)[..., :3]).max()) if spectra else 0) or 1)
@@ -95,7 +96,7 @@ _LONGEST_STEP = 1e6
 
 
 def _require_seen(key: str, value: np.ndarray, direction: np.ndarray, step: float, size: float) -> None:
-    """Raise PathreplayError for a step far larger than the parameter, or lost in single precision."""
+    """Raise PathreplayError for a step that is far larger than the parameter, or that rounds away in float32."""
     remedy = f"leave it out, or give one near {RELATIVE_STEP * size:g}"
     if step * float(np.abs(direction).max()) > _LONGEST_STEP * size:
         raise PathreplayError(f"Step {step} for '{key}' is too long for values up to {size:g}; {remedy}")
@@ -135,6 +136,6 @@ def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
             return FORWARD
         if (value - 2 * move >= 0).all():
             return BACKWARD
-    # Central differences also if both sides have negative entries (a given direction of mixed signs at zeros), which
-    # linear parameters tolerate.
+    # Also if both one-sided stencils reach negative values (a given direction of mixed signs at zeros). Linear parameters
+    # tolerate negative values.
     return CENTRAL

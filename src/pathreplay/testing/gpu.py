@@ -1,7 +1,7 @@
 """Gradient checks and timings on a machine with a GPU, written to one file: `pathreplay doctor --gpu`.
 
-Each item runs in its own process, because running out of device memory may crash the process. The file then contains
-the error of that item, and the others continue.
+Each item runs in its own process, because running out of device memory may crash the process. If an item fails, the
+file contains its error message, and the remaining items still run.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TIMEOUT_S = 300
 ROUNDS = 7
 WALLS = "red.reflectance.value"
 
-# Scene, its arguments, the parameter, and options of `check_gradient`: surfaces, geometry, textures, media.
+# Scene, arguments of the scene, parameter, and options of `check_gradient`. Covers surfaces, geometry, textures, media.
 TRUTHS: dict[str, tuple[str, dict[str, int], str, Json]] = {
     "colour of a wall": ("cornell-box", {"resolution": 32}, WALLS, {}),
     "texture": ("cornell-box-photo", {"resolution": 32, "texture": 16}, "back.bsdf.reflectance.data", {}),
@@ -50,7 +50,7 @@ TIMINGS: dict[str, tuple[Json, int, int, int]] = {
         ("replay", "pathreplay", {"adjoint": "replay"}),
     )
 }
-# Cost of deep records and of replay, between which `auto` chooses.
+# Cost of deep records and of replay; adjoint = 'auto' chooses between these two methods.
 TIMINGS |= {
     f"{adjoint}, 512 x 512, depth {depth}": ({"type": "pathreplay", "adjoint": adjoint}, 512, 16, depth)
     for adjoint, depth in (("recorded", 256), ("recorded", 448), ("replay", 448), ("replay", 2048))
@@ -67,9 +67,10 @@ class Item:
 
 
 def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: Callable[[str], None] = print) -> str:
-    """Run all items (or the named ones) in a variant (default: cuda_ad_rgb), write the file, return a summary line.
+    """Run all items, or those in ``names``, write the results to ``output``, and return a summary line.
 
-    Raises PathreplayError if the variant does not run on this machine, or the file cannot be written.
+    ``variant`` None means cuda_ad_rgb. Raises PathreplayError if the variant does not run on this machine, or the file
+    cannot be written.
     """
     require_writable(output, "--output")
     with interrupts.undisturbed():

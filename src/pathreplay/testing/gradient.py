@@ -42,7 +42,7 @@ class GradientCheck(Judgement):
     step: float
     """Step h: the distance that an entry with direction 1 moves."""
     stencil: str
-    """'central', or 'one-sided' if the parameter is at its bound 0."""
+    """'central', or 'one-sided, up' or 'one-sided, down' if the parameter is at its bound 0."""
     seeds: int
     spp: int
     fd_spp: int
@@ -86,14 +86,17 @@ def check_gradient(  # noqa: PLR0913 (most are keyword-only)
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> GradientCheck:
-    """Compare dF/dt at t = 0 of the parameter value + t · direction with finite differences, over independent seeds.
+    """Compare a directional derivative of the image with finite differences, over independent seeds.
+
+    The derivative is dF/dt at t = 0, where F is the weighted mean of the image (see ``loss``) for the parameter
+    value + t · direction.
 
     Args:
         scene: a scene of an AD variant; its parameters and gradients are restored in any case.
         key: a differentiable parameter of ``mi.traverse(scene)``.
         integrator: the integrator under test: an object, a dictionary, a plugin name, or None. None selects the scene's
-            own integrator if it is differentiable, else ``pathreplay``. Names get the path limits of the scene's
-            integrator.
+            own integrator if it is differentiable, else ``pathreplay``. A plugin given by name gets the path limits of
+            the scene's integrator.
         reference: the integrator whose images are differenced; None for Mitsuba's ``path`` (``volpath`` with media)
             with the same path limits.
         max_depth: path length, if ``integrator`` is None or a name.
@@ -103,21 +106,21 @@ def check_gradient(  # noqa: PLR0913 (most are keyword-only)
         fd_spp: samples per pixel of one image of the reference (None: ``spp``). Each reference seed takes four images,
             at ±h and ±h/2 with common random numbers.
         step: h; None for a hundredth of max(1, largest absolute entry).
-        direction: array of the parameter's shape, not normalised; None for 1 (scalars), a random translation
-            (``to_world``; a rotation for sun and sky), or random positive entries with maximum 1.
+        direction: array of the parameter's shape, not normalised. None selects 1 for a scalar, a random translation for
+            ``to_world`` (a rotation for sun and sky), and random positive entries with maximum 1 otherwise.
         mode: 'backward' (``dr.backward`` through ``mi.render``) or 'forward' (``dr.forward``).
-        loss: None for the mean of the image under smooth weights between 0.5 and 1.5 that differ between channels, so
-            that errors of opposite sign in two places do not cancel. Otherwise a function from the image (TensorXf,
-            height x width x channels) to a scalar, which is linearised once at a rendered image: the check concerns
-            the renderer, and a nonlinear loss of a noisy image would be biased.
+        loss: None for the mean of the image under smooth weights between 0.5 and 1.5. The weights differ between
+            channels, so that errors of opposite sign in two places do not cancel. Otherwise a function from the image
+            (TensorXf, height x width x channels) to a scalar. The function is linearised once at a rendered image,
+            because a nonlinear loss of a noisy image would be biased, and the check concerns the renderer.
         seed: determines all random numbers and the direction.
         progress: called with (finished renderings, total renderings), first with 0 after all arguments are validated.
 
     Returns:
         the estimates, their standard errors and the verdict (see :mod:`pathreplay.testing.verdict`).
 
-    Not checked: components of ``key`` orthogonal to the direction, the loss itself, and the alpha channel (no
-    integrator differentiates it).
+    Not checked: components of the gradient orthogonal to the direction, the loss itself, and the alpha channel, which
+    no integrator differentiates.
 
     Raises:
         PathreplayError: a bad argument, a parameter without derivative, NaN in the scene, an integrator that cannot
@@ -152,7 +155,7 @@ class _Plan:
     ) -> GradientCheck:
         n, stencil = self.seeds, line.stencil
         self._tell()
-        # Distinct 32-bit seeds for the primal image of each gradient, its derivative, the reference, and the weights.
+        # 32-bit seeds for the primal image and the derivative of each gradient, for the reference, and for the weights.
         words = [int(word) for word in np.random.SeedSequence(self.seed).generate_state(3 * n + 1)]
         objective.weigh_by(loss, plain, words[-1], self.fd_spp)
         self._tick()
@@ -193,7 +196,7 @@ class _Plan:
 def _line(
     params: mi.SceneParameters, key: str, by: mi.Integrator, step: float | None, direction: ArrayLike | None, seed: int
 ) -> Line:
-    """Choose the line to check along. Raises PathreplayError for parameters without derivative or differences."""
+    """Choose the line to check along. Raises PathreplayError if the parameter has no derivative or is too coarse."""
     require_differentiable(params, key, by)
     require_finite(params)
     value, owner = get_array(params[key]), params.properties[key][2]

@@ -1,7 +1,7 @@
 """The objective of a check, F(t): a weighted mean of the image, as a function of one parameter along a curve.
 
 F(π) = Σ_k w_k I_k(π) / n is linear in the image. The gradient of one noisy image is therefore an unbiased sample of the
-gradient of F, and the difference of two noisy images an unbiased sample of its difference.
+gradient of F, and the difference of two noisy images is an unbiased sample of a difference of F.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ Loss = Callable[["mi.TensorXf"], "mi.Float"]
 @contextmanager
 def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
     """Detach all parameters, so that only ``key`` will be attached; restore everything at the end."""
-    # Copies, because the map returns references into the scene, which is about to change.
+    # The values are copied, because the map returns references into the scene, whose values are about to change.
     held = {name: dr.copy(params[name]) for name in params.keys() if name == key or dr.grad_enabled(params[name])}
-    # Set through the map and call update(), because objects cache values derived from their parameters.
+    # Values are set through the map, followed by update(), because objects cache values derived from their parameters.
     for name, value in held.items():
         params[name] = dr.detach(value)
     params.update()
@@ -45,10 +45,10 @@ def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
 
 
 class Objective:
-    """The scene on the curve move(value, t) through the value of one parameter, seen by one sensor, with weights.
+    """The objective F(t) for a scene whose parameter ``key`` moves along a curve, seen by one sensor.
 
-    ``move(value, t)`` is the parameter at t, and the value itself at t = 0. Unless stated otherwise, all images of a
-    method use the same seed, i.e. common random numbers.
+    ``move(value, t)`` is the parameter's value at t; at t = 0 it is ``value``, the value in the scene. Unless stated
+    otherwise, all images of a method use the same seed, i.e. common random numbers.
     """
 
     def __init__(self, scene: mi.Scene, params: mi.SceneParameters, key: str, move: Move, sensor: int = 0) -> None:
@@ -71,7 +71,10 @@ class Objective:
         self.weights = np.array(self.adjoint, np.float64)
 
     def weigh_by(self, loss: Loss | None, plain: mi.Integrator, seed: int, spp: int) -> None:
-        """Set smooth weights or the derivative of a loss at a rendered image, and the scale Σ |w_k I_k| / n of F."""
+        """Set the weights, and compute the scale Σ |w_k I_k| / n of F from a rendered image.
+
+        The weights are the derivative of ``loss`` at the image, or `smooth_weights` without a loss.
+        """
         image = self._render(plain, seed, spp)
         if loss is None:
             w = smooth_weights(image.shape, _has_alpha(self.sensor))
@@ -92,7 +95,7 @@ class Objective:
         self.scale = float(np.abs(w * np.array(image, np.float64)).sum())
 
     def dot(self, image: np.ndarray) -> float:
-        """Return the weighted sum, in double precision because its differences are taken."""
+        """Return the weighted sum of an image, in double precision because differences of sums are taken."""
         return float(np.vdot(self.weights, image))
 
     def image(self, integrator: mi.Integrator, seed: int, spp: int, t: float = 0.0) -> np.ndarray:
@@ -145,7 +148,7 @@ class Objective:
         return float(dr.grad(t)[0])
 
     def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
-        """Judge gradients by finite differences along the line, with its stencil and with half the step."""
+        """Judge gradients by finite differences along the line, ``full`` with its step and ``half`` with half of it."""
         # Worst case: rounding errors of half a unit in the last place of every image, all of the same sign.
         unit = np.finfo(get_array(self.value).dtype).eps / 2
         rounding = line.stencil.rounding() * unit * self.scale / line.step
@@ -183,7 +186,7 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
 
 
 def integrator_name(integrator: mi.Integrator) -> str:
-    """Return the name of the integrator as in a scene file (PRBIntegrator: 'prb'), and its boundary terms."""
+    """Return the integrator's name in scene files ('prb' for PRBIntegrator), and its boundary terms unless 'auto'."""
     # For Python plugins Mitsuba's class_name() returns the name of the C++ base class.
     name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     name = name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()

@@ -24,8 +24,8 @@ NO_ROULETTE = 2**30
 """A ``rr_depth`` that no path reaches."""
 
 LONGEST_WITHOUT_ROULETTE = 64
-"""Above this length the reference keeps Russian roulette; without it, paths in a closed room end only at this length.
-"""
+"""Largest ``max_depth`` at which the reference disables Russian roulette, without which paths in a closed room always
+reach ``max_depth``."""
 
 
 def integrator_under_test(
@@ -33,9 +33,9 @@ def integrator_under_test(
 ) -> mi.Integrator:
     """Return the integrator that ``spec`` describes: an object (used unchanged), a dictionary, a plugin name, or None.
 
-    None selects the scene's own integrator if it is differentiable, else ``pathreplay``. A plugin given by
-    name, or selected by None, gets the path limits of the scene's own integrator. ``max_depth`` overrides them, and
-    ``boundary`` holds additional properties of `pathreplay` (``boundary``, ``boundary_spp``).
+    None selects the scene's own integrator if it is differentiable, else ``pathreplay``. A plugin given by name, or
+    selected by None, gets the path limits of the scene's own integrator. ``max_depth`` overrides their path length, and
+    ``boundary`` contains additional properties of `pathreplay` (``boundary``, ``boundary_spp``).
 
     Raises PathreplayError if Mitsuba cannot create it, if ``max_depth`` is invalid or given with a finished integrator,
     or if boundary terms are requested from another integrator than `pathreplay`.
@@ -70,9 +70,9 @@ def integrator_under_test(
 def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> mi.Integrator:
     """Return the integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
 
-    Its Russian roulette is disabled if paths are short enough. This leaves the expected image unchanged, prevents
-    decisions from changing between +h and -h, and allows throughputs to be negative, as they are next to a reflectance
-    of 0.
+    Russian roulette is disabled if paths are short enough, which does not change the expected image. Without roulette,
+    no decision to end a path differs between +h and -h. Throughputs may then also be negative, as they are near a
+    reflectance of 0.
 
     Raises PathreplayError if the path length of the tested integrator cannot be read, or ``spec`` cannot be created.
     """

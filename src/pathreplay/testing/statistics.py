@@ -1,8 +1,8 @@
 """Statistics of small samples: means with standard errors, and differences of means as normal deviates.
 
-Standard errors are estimated from the samples, so that a difference divided by its error follows Student's
-distribution. ``z`` is the normal deviate with the same probability as that ratio: |z| < 4 means the same for 3 seeds as
-for 300. All functions take numbers or arrays; samples are along the first axis.
+Standard errors are estimated from the samples. A difference divided by its error therefore follows Student's
+distribution. ``z`` is the normal deviate with the same tail probability as this ratio, so that |z| < 4 means the same
+for 3 seeds as for 300. All functions take numbers or arrays; samples are along the first axis.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def mean_and_error(samples: ArrayLike) -> tuple[Numbers, Numbers]:
 
 
 def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
-    """Compare the means of independent samples (n, ...) and (m, ...); ``b`` without a sample axis is exact."""
+    """Compare the means of independent samples (n, ...) and (m, ...). Without a sample axis, ``b`` is an exact value."""
     a, b = np.asarray(a), np.asarray(b)
     known = b.ndim < a.ndim
     (mean_a, error_a), (mean_b, error_b) = mean_and_error(a), (b, 0) if known else mean_and_error(b)
@@ -42,7 +42,7 @@ def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
 def welch(difference: Numbers, σ: Numbers, *parts: tuple[Numbers, int]) -> Numbers:
     """Convert difference/σ to z, where ``parts`` (standard error, number of samples) are estimated contributions to σ.
 
-    The remaining contributions to σ are known and add no uncertainty to it (Welch-Satterthwaite).
+    All other contributions to σ are known exactly and add no uncertainty to σ (Welch-Satterthwaite).
     """
     difference, σ = np.asarray(difference, np.float64), np.asarray(σ, np.float64)
     noise = sum(np.asarray(error, np.float64) ** 4 / (n - 1) for error, n in parts)

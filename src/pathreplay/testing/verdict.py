@@ -1,8 +1,9 @@
-"""The verdict on a gradient: the conclusion that two sets of independent samples permit, in pure arithmetic.
+"""The verdict on a gradient, computed from two sets of independent samples.
 
-Given are n samples of the gradient under test and n of its reference, all from independent seeds. The reference
-consists of two finite differences per seed, with steps h and h/2, whose error is O(h²). The Richardson extrapolation (4
-D(h/2) - D(h)) / 3 removes this term. The change caused by halving the step, beyond noise, bounds the remaining error.
+The inputs are n samples of the gradient under test and n samples of the reference, all from independent seeds. The
+reference consists of two finite differences per seed, with steps h and h/2, whose error is O(h²). The Richardson
+extrapolation (4 D(h/2) - D(h)) / 3 removes this error term. The change from D(h) to D(h/2), as far as it exceeds the
+noise, bounds the remaining error.
 
     σ² = se(gradient)² + se(reference)² + step_error²,      z = (mean gradient - mean reference) / σ
 
@@ -69,8 +70,8 @@ def judge(
     """
     with np.errstate(invalid="ignore"):  # infinite samples are handled below
         reference = (4 * half_step - full_step) / 3
-        # The error of D(h/2) is a third of the change caused by halving; using it for the better combination is
-        # conservative.
+        # The error of D(h/2) is a third of the change caused by halving the step. Using this error for the extrapolation,
+        # which is more accurate, is conservative.
         change, change_se = mean_and_error((half_step - full_step) / 3)
         g, g_se, r, r_se = map(float, (*mean_and_error(gradient), *mean_and_error(reference)))
     truncation = math.sqrt(max(0.0, change**2 - change_se**2))

@@ -1,4 +1,4 @@
-"""Derivatives of individual tentative collisions along a path, for the listing driver.
+"""Derivatives of individual tentative collisions along a path, for the driver `listing`.
 
 The collisions are reproduced from the same random numbers instead of being stored.
 """
@@ -28,7 +28,7 @@ def differentiate_flight(at: Arrival, flight: Flight, past: Sampler, active: mi.
         u = past.next_1d(flying)
         t += dr.select(σ_bar > 0, -dr.log(1 - u) * dr.rcp(σ_bar), dr.inf)
         inside = flying & (t < b)
-        past.next_1d(inside)  # the number that decided between a real and a null collision
+        past.next_1d(inside)  # skips the random number that decided between a real and a null collision
         real = inside & flight.event & (t >= flight.t)
         flying = inside & ~real
         _differentiate(medium, ray, t, σ_bar, flying, real, weight)

@@ -2,8 +2,9 @@
 
 A second pass with the same random numbers differentiates each tentative collision: null collisions as dσ_n/σ_n and real
 collisions as dσ_s/σ_s (supplement of Vicini, Speierer, Jakob 2021, listings 1 and 2). Where σ_n or σ_s is zero, such a
-collision is never sampled, and its derivative is missing. On a constant grid this is the whole derivative of the
-transmittance. `pathreplay` does not have this limitation; this driver exists for comparison.
+collision is never sampled, and its derivative is missing. On a constant grid, σ_n is zero everywhere, and the whole
+derivative of the transmittance is missing. `pathreplay` does not have this limitation. This driver exists for
+comparison.
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ T = TypeVar("T")
 def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters and the ``start``; return whether paths move.
 
-    The estimator is that of `sweep`: equal random numbers give equal gradients. Not differentiated: see `tape`. Raises
-    PathreplayError if no parameter reaches the paths.
+    Uses the same estimator as `sweep`: equal random numbers give equal gradients. Not differentiated: see `tape`.
+    Raises PathreplayError if no parameter reaches the paths.
     """
     with dr.resume_grad(), dr.isolate_grad():
         L, _, moves = tape(trace, start)
@@ -47,7 +47,8 @@ def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter)
 def _cut(state: T) -> T:
     """Return the same values, and make AD passes evaluate their derivatives at this point.
 
-    Otherwise the reverse pass is a single kernel whose size grows with depth: at 64 vertices it compiles for a minute.
+    Otherwise the reverse pass is a single kernel whose size grows with depth. At 64 vertices, compilation takes a
+    minute.
     """
 
     class Cut(dr.CustomOp):

@@ -25,7 +25,7 @@ ATTACH = ("delta", "none")
 
 @dataclass(frozen=True)
 class OtherInterior:
-    """The interior term by another driver.
+    """The interior term of a baseline, computed by its drivers.
 
     Media are differentiated with the score-function estimator, without control variate. Empty voxels get no derivative.
     """
@@ -42,7 +42,7 @@ class OtherInterior:
         return back_propagate(view, trace, grad_in, self.reverse_driver)
 
     def note(self, trace: TraceConfig) -> str:
-        """See `Term`: none."""
+        """Return "": this term has no notes."""
         return ""
 
 
@@ -63,8 +63,8 @@ class NaiveIntegrator(PathIntegrator):
 class RadiativeIntegrator(PathIntegrator):
     """Radiative backpropagation, for comparison only: time grows with the square of the depth.
 
-    Properties: as in `PathIntegrator`, and ``linear`` (False: unbiased; True: the biased variant in linear time), see
-    `radiative`. Motion is not differentiated, and there is no forward mode.
+    Properties: as in `PathIntegrator`, and ``linear``. False (the default) is unbiased; True selects a biased variant
+    in linear time, see `radiative`. Motion is not differentiated, and there is no forward mode.
     """
 
     name = "radiative_backprop"

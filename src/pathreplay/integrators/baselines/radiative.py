@@ -35,8 +35,8 @@ def radiative(
     ``linear`` selects a biased variant in linear time that leaves out the incident radiance, like the variants in the
     paper: L_{i+1} is replaced by one in all channels wherever a path continues, while emission and next-event
     estimation (e_i) are unchanged. The magnitude of the gradient is then wrong, and where media are also dark, its sign
-    may be wrong. No paths are ``lost``. Not differentiated: all motion (as with ``attach='none'``), and visibility.
-    Raises PathreplayError if no parameter reaches the paths.
+    may be wrong. The counter ``lost`` is not used. Not differentiated: visibility and, as with ``attach='none'``, all
+    motion. Raises PathreplayError if no parameter reaches the paths.
     """
     sampler, path = start.sampler, PathState.begin(trace, start)
 

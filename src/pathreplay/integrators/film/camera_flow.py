@@ -11,10 +11,10 @@ Its derivative therefore has two parts. The first differentiates the weights, wi
 
     ∫_D div(W v) L ds - ∮_∂D W L v·n dl.
 
-The second is the derivative of L along the ray c(T, π), which moves by ∂c/∂π + ∂c/∂s v, the *rest* of the motion. The
-sum is correct for any smooth v. `CameraFlow` chooses v such that points at a distance r stay fixed: with p = o + r d on
-the ray, v = -(∂p/∂s)⁺ ∂p/∂π. Rotation and change of the field of view then leave no rest; translation leaves parallax.
-For a static camera, `SurfaceFlow` follows the visible surfaces.
+The second part is the derivative of L along the ray c(T, π). This ray moves by ∂c/∂π + ∂c/∂s v, the *rest* of the
+motion. The sum of both parts is correct for any smooth v. `CameraFlow` chooses v such that points at a distance r stay
+fixed: v = -(∂p/∂s)⁺ ∂p/∂π for the point p = o + r d on the ray. Rotation and change of the field of view then leave no
+rest; translation leaves parallax. For a static camera, `SurfaceFlow` follows the visible surfaces.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PINHOLE = "PerspectiveCamera"
 CAMERAS = frozenset({PINHOLE, "ThinLensCamera", "OrthographicCamera"})
 """Classes of sensors whose rays are smooth functions of the film position, also outside the border of the film."""
 ONLY_POSITIONS = "x_fov", "principal_point_offset_x", "principal_point_offset_y"
-"""Parameters of cameras that change only the film position at which a ray arrives: they leave no rest."""
+"""Camera parameters that change only the film position of a ray. The flow contains their whole motion."""
 OTHERS = "to_world", "focus_distance", "aperture_radius"
 STEP = 1 / 256
 """Step of central differences, in film widths. The error is 4e-6 at a field of view of 40 degrees, 1e-4 at 120."""
@@ -70,7 +70,7 @@ class FilmFlow(Protocol):
 
     @property
     def samples(self) -> int:
-        """Number of samples of the pass that correspond to one group of paths in `FilmMotion`."""
+        """Number of samples of a pixel for which `FilmMotion` traces one group of paths."""
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """Return the sensor's ray and its weight.
@@ -150,13 +150,13 @@ class CameraFlow:
         """Do nothing, since all terms differentiate the sensor itself."""
 
     def _velocity(self, ray: mi.Ray3f, derivatives: RayDerivatives) -> mi.Vector2f:
-        """Return the velocity (of value zero) from an attached ray and its derivatives by film position."""
+        """Return the velocity (of value zero) from an attached ray and its derivatives along the film's axes."""
         δp = (ray.o - dr.detach(ray.o)) + self.r * (ray.d - dr.detach(ray.d))
         return -film_velocity(δp, derivatives, self.r)
 
 
 def film_velocity(δp: mi.Vector3f, derivatives: RayDerivatives, t: mi.Float) -> mi.Vector2f:
-    """Return the velocity at which points at distance t that move by δp cross the film, by least squares."""
+    """Return the film velocity of points at distance t on the rays, which move by δp, by least squares."""
     x, y = (o_k + t * d_k for o_k, d_k in zip(*derivatives, strict=True))
     xx, xy, yy = dr.dot(x, x), dr.dot(x, y), dr.dot(y, y)
     a, b = dr.dot(x, δp), dr.dot(y, δp)
@@ -193,7 +193,10 @@ def ray_derivatives(sensor: mi.Sensor, sample: Sample) -> RayDerivatives:
 
 
 def _is_carried(sensor: mi.Sensor) -> bool:
-    """Return whether the camera translates. The flow contains all motion of a pinhole camera that only rotates."""
+    """Return whether a change of the camera's pose leaves a rest of the motion.
+
+    For a pinhole camera, only translation leaves a rest. For any other camera, every gradient of the pose counts.
+    """
     poses = with_gradients(sensor, "to_world")
     if sensor.class_name() != PINHOLE:
         return bool(poses)

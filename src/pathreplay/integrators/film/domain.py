@@ -21,7 +21,7 @@ QUADRATURE = 128
 
 @dataclass(frozen=True)
 class FilmPlaces:
-    """The domain of camera paths on a film: its crop window, with the border if it samples one. See `FilmDomain`."""
+    """The part of a film on which paths start: the crop window, with the border if it is sampled. See `FilmDomain`."""
 
     view: Pass
     corner: mi.ScalarPoint2f  # position of the domain's lower corner on the film, in pixels
@@ -43,7 +43,7 @@ class FilmPlaces:
         return mi.Ray3f(ray), dr.detach(weight)
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
-        """Return whether static surfaces may slide under a film position: see `FilmDomain`."""
+        """Return whether static surfaces may move relative to a film position: see `FilmDomain`."""
         flow = self.view.flow
         return mi.Bool(False) if flow is None else flow.leaves_rest_at(self.in_sensor(s))
 
@@ -63,7 +63,7 @@ class FilmPlaces:
         return (self.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
 
     def undeveloped(self, grad_in: mi.TensorXf) -> mi.TensorXf:
-        """Return the adjoint g_j / ∫ h_j of block pixels, with the adjoint g of the image and pixel filters h_j."""
+        """Return the adjoint g_j / ∫ h_j of block pixels. The image has the adjoint g, and pixel j the filter h_j."""
         with dr.resume_grad():
             pixels = mi.TensorXf(self._block().tensor())
             dr.enable_grad(pixels)
@@ -111,7 +111,7 @@ class FilmPlaces:
         return block.tensor()
 
     def developed(self, pixels: mi.TensorXf) -> mi.TensorXf:
-        """Develop the pixels of a block without weights: each pixel is divided by ∫ h_j."""
+        """Develop a block that has no sample weights: divide each pixel j by the integral ∫ h_j of its filter."""
         film, block = self.view.sensor.film(), self._block()
         height, width, channels = pixels.shape
         index = dr.arange(mi.UInt32, height * width * channels)
@@ -123,7 +123,7 @@ class FilmPlaces:
         return film.develop()
 
     def _filter_integral(self, block: mi.ImageBlock, index: mi.UInt32, axis: int) -> mi.Float:
-        """Return ∫ h_j along one axis, over the domain, for pixels by their index on this axis."""
+        """Return the integral of h_j over the domain along one axis, for pixels j given by their index on this axis."""
         rfilter = self.view.sensor.film().rfilter()
         if rfilter.is_box_filter():
             return mi.Float(1)

@@ -1,6 +1,6 @@
 """Filter importance sampling, so that each path belongs to one pixel for any filter.
 
-With positions drawn from the density w / ∫ w, where w is the filter, the mean radiance of paths is the filtered pixel
+If positions are drawn from the density w / ∫ w of a filter w, the mean radiance of paths is the filtered pixel
 (Ernst, Stamminger and Greiner, "Filter Importance Sampling", 2006). Pixels share no samples, so images are noisier than
 with splatting. A filter is the product of a function of x and one of y, tabulated as `STEPS` constant steps. If the
 function has negative parts, its absolute value is sampled, and `sign` returns the sign.
@@ -43,7 +43,7 @@ class FilterSamples:
     @staticmethod
     def of_derivative(film: mi.Film) -> FilterSamples:
         """Create the sampler of the filter's derivative. A jump, as at the ends of a box, becomes a point mass."""
-        radius = film.rfilter().radius() * STEPS / (STEPS - 1)  # puts jumps at its ends into the middle of steps
+        radius = film.rfilter().radius() * STEPS / (STEPS - 1)  # jumps at the filter's ends then lie inside a step
         step = 2 * radius / STEPS
         x = _step_centres(radius)
         return FilterSamples._of(radius, film.rfilter().eval(x + 0.5 * step) - film.rfilter().eval(x - 0.5 * step))

@@ -14,8 +14,8 @@ from pathreplay.platform.registration import mitsuba_integrator
 
 # Dr.Jit counts the samples of one kernel in 32 bits.
 MOST_SAMPLES = 2**32 - 1
-# Bytes per pixel. A rendering, its derivative and their files take 127, measured as the peak of the process for 2048 x
-# 2048 pixels on LLVM. The memory of samples is negligible.
+# Bytes per pixel. A rendering, its derivative and their files take 127 bytes per pixel, measured as the peak memory of
+# the process for 2048 x 2048 pixels on LLVM. The memory of samples is negligible.
 _A_PIXEL = 128
 
 
@@ -45,14 +45,14 @@ def splat(view: Pass, rays: Rays, L: mi.Spectrum, valid: mi.Bool) -> mi.TensorXf
 def adjoint(view: Pass, rays: Rays, grad_in: mi.TensorXf) -> mi.Spectrum:
     """Return δL of each ray: the adjoint ``grad_in`` of the image, propagated back through filter and normalisation."""
     with dr.resume_grad():
-        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.position))  # full width, even if all rays are equal
+        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.position))  # one entry per ray, even if all rays are equal
         dr.enable_grad(L)
         image = splat(view, rays, L, mi.Bool(True))
         dr.set_grad(image, grad_in)
         dr.enqueue(dr.ADMode.Backward, image)
         dr.traverse(dr.ADMode.Backward)
         δL = dr.grad(L)
-    view.sensor.film().clear()  # discard the splatted ones
+    view.sensor.film().clear()  # discard the radiance 1 that was splatted
     return δL
 
 
@@ -100,10 +100,11 @@ def fit_film(sensor: mi.Sensor, shape: Sequence[int]) -> None:
 def make_ready(sensor: mi.Sensor) -> None:
     """Initialise the film storage and the sampler state of a sensor, as its first rendering would.
 
-    A recorded pass depends on all sensors of a scene and must be recorded again when one of them changes.
+    A pass recorded by `dr.freeze` depends on all sensors of the scene. The first rendering with a sensor would change
+    the sensor, so that the pass would have to be recorded again.
     """
     sensor.film().prepare([])
-    sensor.sampler().seed(0, 1)  # as `mi.render` leaves it
+    sensor.sampler().seed(0, 1)  # the state in which `mi.render` leaves the sampler
 
 
 def picture_shape(sensor: mi.Sensor) -> tuple[int, int, int]:

@@ -4,9 +4,9 @@ With the filter h_j of pixel j, restricted to the film D, and the velocity v of 
 
     dI_j/dπ = 1/∫_D h_j · ( ∫_D div(h_j v) L ds - ∮_∂D h_j L v·n dl ).
 
-Filters are products h_j = f(x) f(y), and at the border of the film f(x) jumps to zero. Both parts with ∂f/∂x therefore
-form one integral over a measure df(x), whose mass outside the film is concentrated at the border. The three integrals
-are
+Filters are products h_j = f(x) f(y), and f(x) jumps to zero at the border of the film. The slope of f inside the film
+and the jump therefore form one measure df(x). The mass of df outside the film is concentrated at the border. The three
+integrals are
 
     ∫ f(y) dy ∫ v_x L df(x),        ∫ f(x) dx ∫ v_y L df(y),        ∫_D h_j (∂v_x/∂x + ∂v_y/∂y) L ds.
 
@@ -15,8 +15,9 @@ signs. Paths are sampled in such pairs with the same random numbers, so that com
 in a finite difference of two images. Paths only estimate L: they are not differentiated, and no edges are sampled.
 
 On a film of many pixels, the two positions are close to each other and their difference is mostly noise. The adjoint
-W_j of the pixels is therefore split. Its local mean W̄_j is smooth, so that contributions of adjacent pixels cancel
-better than pairs do. A path at x contributes to all pixels of its row at once, with the weight
+W_j of the pixels is therefore split into its local mean W̄_j and the remainder. The local mean is smooth, so that the
+contributions of adjacent pixels cancel better than those of a pair. A path at x contributes to all pixels of its row
+at once, with the weight
 
     (W_j - W̄_j) sgn df(x - x_j) + Σ_i W̄_i df(x - x_i) / Σ_i |df(x - x_i)|,
 
@@ -62,7 +63,7 @@ class FlowPaths:
     sample: Sample  # sample of the camera ray
     axis: mi.UInt32  # axis along which the two positions of a pair differ
     single: mi.Bool  # whether the path is the one for the divergence
-    offset: mi.Float  # of a pair: distance from the pixel centre along the axis
+    offset: mi.Float  # distance of a path of a pair from the pixel centre, along the axis
     derivative: FilterSamples  # sampler of the offsets: the derivative of the filter
     L: mi.Spectrum  # weighted radiance, the factor of the velocity or divergence
     wavelengths: mi.Spectrum
@@ -95,7 +96,7 @@ class FilmMotion:
             for i, factor in self._smooth_factors(view, f)
         )
         δ = dr.sum(W * f.L)
-        # Gradients of camera parameters are separate sums; without this evaluation, each would trace the paths again.
+        # Each camera parameter's gradient is a separate sum; without this evaluation, each sum would trace all paths.
         dr.eval(δ, f.sample.position)
         with dr.resume_grad():
             backward(δ * self._flow_factor(view, f))
@@ -103,7 +104,7 @@ class FilmMotion:
         return TermResult()
 
     def note(self, trace: TraceConfig) -> str:
-        """See `Term`: none."""
+        """Return "": this term has no notes."""
         return ""
 
     def _flow_factor(self, view: Pass, f: FlowPaths) -> mi.Float:
@@ -112,10 +113,10 @@ class FilmMotion:
         return dr.select(f.single, self.flow.divergence(f.sample), dr.select(f.axis == 0, v.x, v.y))
 
     def _smooth_factors(self, view: Pass, f: FlowPaths) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Return pixels and factors: each path of a pair receives the sum of factor times W̄ of the pixel.
+        """Return pixels and factors. The adjoint of a path of a pair receives the sum of factor · W̄ over the pixels.
 
-        The factors are relative to the weight of the path's own pixel. The first entry subtracts W̄ of that pixel, which
-        the full adjoint W contains.
+        The factors are relative to the weight of the path's own pixel. The first entry subtracts W̄ of the path's own
+        pixel, because the full adjoint W contains this mean.
         """
         width, height = view.size
         derivative, along_x = f.derivative, f.axis == 0
@@ -133,9 +134,10 @@ class FilmMotion:
         return [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *((pixel, mass * scale) for pixel, mass in masses)]
 
     def _mean_radiance(self, view: Pass, trace: TraceConfig) -> mi.Float:
-        """Estimate the mean radiance of positions with flow, from independent paths.
+        """Estimate the mean radiance over the positions at which the flow may be non-zero, from independent paths.
 
-        Its subtraction from all radiance reduces noise and adds no bias: motion does not change a constant image.
+        Subtracting this mean from all radiance reduces noise. It adds no bias, because motion does not change a
+        constant image.
         """
         width, height = view.size
         pixel = dr.arange(mi.UInt32, width * height)
@@ -200,5 +202,5 @@ def blurred(pixels: mi.TensorXf) -> mi.TensorXf:
             inside = (position + k >= 0) & (position + k < most)
             total += dr.gather(mi.Float, values, mi.UInt32(mi.Int32(index) + k * stride), inside)
         values = total / (2 * reach + 1)
-        dr.eval(values)  # gathered at other indices next
+        dr.eval(values)  # required before the next axis gathers from these values
     return mi.TensorXf(values, pixels.shape)

@@ -26,10 +26,10 @@ def _largest_spp(max_depth: int) -> int:
 def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) -> str:
     """Return why a pixel sweep is impossible for a sensor, as the end of a sentence, with the remedy; "" if possible.
 
-    Requirements: a box filter, so that each path belongs to one pixel, or, if only ``some`` pixels are swept, any
-    non-negative filter (see `FilterSamples`); an rgb image without alpha; an independent sampler; a camera without
-    motion and with an instantaneous shutter; at least two paths per pixel (``spp``), which fit into the record of a
-    lane.
+    A sweep requires an rgb image without alpha, an independent sampler, and a camera without motion and with an
+    instantaneous shutter. The filter must be a box, so that each path belongs to one pixel. If only ``some`` pixels are
+    swept, any non-negative filter can be used (see `FilterSamples`). A pixel must have at least two paths (``spp``),
+    which together fit into the record of a lane.
     """
     film, sampler = sensor.film(), sensor.sampler()
     film.prepare([])
@@ -63,8 +63,8 @@ def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) ->
 def pixel_camera(sensor: mi.Sensor, pixel: mi.UInt32) -> Callable[..., tuple[mi.Ray3f, mi.Spectrum]]:
     """Return a function that samples rays through pixels (UInt32, row-major): (sampler, active) -> Ray3f and Spectrum.
 
-    The Spectrum is the weight of the ray. Rays are those of Mitsuba's RBIntegrator, except that the film's filter is
-    importance sampled. Detached.
+    The Spectrum is the weight of the ray. Rays are sampled as in Mitsuba's RBIntegrator, except that the film's filter
+    is importance sampled. The results are detached.
     """
     width, height = sensor.film().crop_size()
     sample_position = _position_sampler(sensor.film(), mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)))
@@ -95,7 +95,9 @@ def _position_sampler(film: mi.Film, corner: mi.Point2f) -> Callable[[mi.Point2f
 def pixel_loss(
     view: Pass, max_depth: int, offset: mi.TensorXf, slope: mi.TensorXf, pixels: mi.UInt32 | None
 ) -> PixelLoss:
-    """Gather the loss derivative of each lane's pixel, for all pixels or for ``pixels`` (one row of the tensors each).
+    """Gather the loss derivative for the pixel of each lane.
+
+    The lanes are all pixels or, if given, ``pixels``; the tensors then have one row per pixel.
 
     Raises PathreplayError for an unsuitable number of samples, a wrong shape, or repeated or invalid pixels.
     """

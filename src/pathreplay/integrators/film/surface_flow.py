@@ -5,15 +5,15 @@ A few probe rays sample the scene. A point p that a probe ray hits moves with it
     u = (∂(o + t d)/∂s)⁺ ∂p/∂π,
 
 where o + t d is the point at the same distance t on the ray through the film position s. If film positions are fixed,
-the surface slides under them at u / cos, where cos is the cosine between normal and ray. This is unbounded at
-silhouettes, so that points at grazing angles have the largest weights. The velocity at a node of a grid is the mean
+the surface slides under them at u / cos, where cos is the cosine between normal and ray. This speed is unbounded at
+silhouettes. Points at grazing angles therefore have the largest weights. The velocity at a node of a grid is the mean
 
     v = Σ K W u / (K_0 + Σ K (W + S)),     W = 1 / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
 
-over nearby points, where r is their distance from the node on the film; between nodes it is interpolated. Static points
-contribute with u = 0. For a narrow field of view u is large, and following it causes more noise than sliding; the term
-S then reduces v. Every v gives the same derivative (see `FilmFlow`). This one leaves little motion to the interior and
-boundary terms.
+over nearby points, where r is their distance from the node on the film. Static points contribute with u = 0. Between
+nodes, v is interpolated. In a narrow field of view, u is large, and following u causes more noise than sliding does.
+The term S then reduces v. Every v gives the same derivative (see `camera_flow`). The choice above leaves little motion
+to the interior and boundary terms.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ NODES = CELLS + 1 + 2 * MARGIN
 REACH, NEAR, K_0 = 0.25, 0.03, 1e3
 """REACH and NEAR in film widths; K_0 is a weight that favours fixed film positions."""
 GRAZING, NARROW = 0.1, 0.004
-"""Cosine below which W levels off; and S times the square of the film's width in radians."""
+"""GRAZING is the cosine below which W levels off. NARROW is S times the square of the film's width in radians."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class SurfaceFlow:
 
     sensor: mi.Sensor
     nodes: mi.Vector2f  # velocities at grid nodes: their values are zero, and they are attached to moving surfaces
-    flows: mi.Bool  # for each cell, at its first node: whether the velocity may be non-zero in or next to it
+    flows: mi.Bool  # per cell, at the cell's first node: whether the velocity may be non-zero in or next to the cell
     is_all: bool = False
     samples: int = 5
 
@@ -133,9 +133,9 @@ class SurfaceFlow:
 def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     """Return whether film positions may follow visible surfaces.
 
-    Everything else then slides under the film positions, so that all edges must be sampled. This is impossible for
-    edges behind mirrors, glass and thin sheets and on B-spline curves. Media are not supported. (Seams of textures are
-    not sampled either: see `has_seams`.)
+    All other surfaces then slide under the film positions, so that the edges of all surfaces must be sampled. Edges
+    behind mirrors, glass and thin sheets and edges on B-spline curves cannot be sampled. Media are not supported.
+    (Seams of textures are not sampled either: see `has_seams`.)
     """
     traits = trace.traits
     hidden = traits.mirrors or traits.veils or traits.splines
