@@ -1,8 +1,8 @@
 """Cast shadows: film positions onto which moving shapes may cast a shadow. They only guide the pilot pass.
 
-The shadow of a small object covers few pixels, and few segments would hit it. A point on a moving shape, and a
-direction from which light arrives there, define a ray. Its continuation hits the surface that the shape may shadow.
-Visibility from the camera is not tested.
+The shadow of a small object covers few pixels, and few segments would hit it. A point on a moving shape and the
+direction in which light arrives at this point define a ray. Behind the shape, the ray hits the surface on which the
+shadow may fall. Visibility from the camera is not tested.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Chains of delta lobes from the camera: probe them, find the vertex where two of them diverge, and record them.
+"""Chains, the parts of camera paths that pass only through delta lobes: probe, compare and record them.
 
-Neighbouring chains share their random numbers, and therefore their lobes. If their lobes differ because selection
-probabilities differ, there is no edge: the difference is due to sampling.
+Neighbouring chains share their random numbers, and therefore usually select the same lobes. If they select different
+lobes because the selection probabilities differ, there is no edge: the difference is due to sampling.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
     """Return the configuration for chains.
 
     Russian roulette is off, because it would end neighbouring paths at different depths. Media and null boundaries are
-    left out, because chains pass through them with the transmittance as weight.
+    left out, because chains pass through them; `transmittance_of_chain` is a separate factor.
     """
     chain = replace(trace, rr_depth=NEVER, max_depth=min(trace.max_depth, MAX_CHAIN))
     return chain if trace.media is None else replace(chain, media=None, skips_null=True)  # type: ignore[arg-type]
@@ -43,9 +43,10 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
 
 @dr.syntax
 def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> VisibilityProbe:
-    """Probe a path from the camera to its first smooth vertex; surfaces before the first that may move are ignored.
+    """Probe a path from the camera to its first vertex without a delta lobe.
 
-    Where ``flows``, all surfaces may move relative to the film position.
+    Vertices before the first surface that may move are ignored. Where ``flows``, all surfaces may move relative to the
+    film position.
     """
     sampler = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
@@ -98,7 +99,7 @@ def _scattered(
 
 
 def _slides(trace: TraceConfig, at: Arrival) -> mi.Bool:
-    """Return whether the surface has a delta lobe, by which a path may continue its chain."""
+    """Return whether the surface has a delta lobe, through which a chain may continue."""
     valid = at.hit.is_valid()
     return valid & mi.has_flag(shape_met(trace, at.hit, at.ray, valid).bsdf().flags(), mi.BSDFFlags.Delta)
 
@@ -111,7 +112,7 @@ def _shadow_test(trace: TraceConfig, at: Arrival, key: mi.UInt32, k: mi.UInt32, 
 class ChainSplit:
     """The vertex at which two neighbouring chains diverge."""
 
-    k: mi.UInt32  # number of vertices before, which both chains share
+    k: mi.UInt32  # number of vertices before this one, which both chains share
     a: Arrival
     b: Arrival
     β: mi.Spectrum  # throughput before the vertex
@@ -152,7 +153,10 @@ def split_chains(trace: TraceConfig, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UI
 def record_chain(
     trace: TraceConfig, s: mi.Point2f, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, at: mi.Ray3f, active: mi.Bool
 ) -> tuple[EdgePath, mi.Bool]:
-    """Record ``k`` vertices along ``ray``, and the ray ``at`` to an edge; return the path and the mask of successes."""
+    """Record the first ``k`` vertices of the chain along ``ray``, from which the ray ``at`` leads to an edge.
+
+    Returns the recorded path, and the lanes in which the chain has enough vertices.
+    """
     layout = Layout.of(trace, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
     sampler = CounterSampler.of(key)
@@ -173,7 +177,10 @@ def record_chain(
 def transmittance_of_chain(
     trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, reach: mi.Float, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
-    """Estimate the transmittance of a chain up to ``reach`` after its k-th vertex; also return the medium there."""
+    """Estimate the transmittance of a chain up to the distance ``reach`` after its k-th vertex.
+
+    Also returns the medium at this distance.
+    """
     chain = chain_config(trace)
     sampler, transmittance_sampler = CounterSampler.of(key), CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_CHAIN)
     path = PathState.begin(chain, CameraStart(ray, sampler, active))

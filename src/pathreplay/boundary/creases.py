@@ -20,10 +20,10 @@ from pathreplay.transport.vertex import Arrival, TraceConfig
 MEETS = 1e-3
 """Largest relative difference of distances at which two surfaces are considered in contact."""
 ASIDE = 2.0
-"""Distance from a contact line to which hits are moved, relative to the smallest distance at which ray origins, with
-their offset, lie in front of both surfaces."""
+"""Distance from a contact line to which hits are moved, in multiples of a smallest distance. At the smallest distance,
+ray origins with their offset just lie in front of both surfaces."""
 STEEPEST = 8.0
-"""Cotangent of half the angle of the sharpest corner for which that distance suffices: 14 degrees."""
+"""Cotangent of half the sharpest angle between two surfaces, 14 degrees, for which the distance above suffices."""
 
 Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
 """A hit and its ray."""
@@ -55,12 +55,12 @@ class Crease:
 
     @property
     def exists(self) -> mi.Bool:
-        """Whether there is such an edge."""
+        """Whether there is an edge other than an outline."""
         exists = self.meets | self.turns
         return exists if self.shadow is None else exists | self.shadow.exists
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        """Evaluate B, zero on the edge and in lanes without one. Differentiable in the ray and in the shapes."""
+        """Evaluate B, zero on the edge and in lanes without an edge. Differentiable in the ray and in the shapes."""
         meets, turns = active & self.meets, active & self.turns
         t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, meets).t for hit in (self.a, self.b)]
         si = self.a.compute_surface_interaction(ray, mi.RayFlags.All, turns)
@@ -71,9 +71,10 @@ class Crease:
 def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> list[Arrival]:
     """Return the arrivals on two sides of an edge, moved apart where two surfaces form a concave corner.
 
-    Ray origins are offset from their surface. Closer to a contact line than this offset, they lie behind the other
-    surface, and rays may see the sky below a floor. Radiance is continuous along each surface. The error of moving the
-    hits is therefore proportional to the distance, which is some thousandths of the size of objects.
+    Ray origins are offset from their surface. If a hit is closer to a contact line than this offset, the ray origin
+    lies behind the other surface, and rays may see the sky below a floor. Radiance is continuous along each surface.
+    The error of moving the hits is therefore proportional to the distance that they move, some thousandths of the size
+    of objects.
     """
     sides = [(at, at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal, active)) for at in (a, b)]
     normals = [dr.select(dr.dot(si.n, at.ray.d) > 0, -si.n, si.n) for at, si in sides]
@@ -85,7 +86,7 @@ def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> 
     separation = dr.dot(across, a.ray.d - b.ray.d)
     moved = []
     for (at, si), n, other, side in zip(sides, normals, reversed(normals), (separation, -separation), strict=True):
-        away = dr.normalize(other - dr.dot(other, n) * n)  # along the surface, towards the front of the other
+        away = dr.normalize(other - dr.dot(other, n) * n)  # along the surface, to the front of the other one
         moved.append(_towards(trace, at, si.p + x * away, 4 * x, ok & (dr.dot(across, away) * side > 0)))
     return moved
 

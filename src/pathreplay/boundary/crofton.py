@@ -5,9 +5,9 @@ p(c) be the density of their centres, and let their directions be uniform. The e
 crossings with edges is 2 l / π times the integral of g along the edges. Different signatures at the ends of a segment
 indicate a crossing; bisection locates it.
 
-Two crossings of one segment, for example at a corner, leave its ends equal. Segments with equal ends are therefore also
-probed in the middle. A segment on which only the middle differs also represents segments that contain the differing
-part elsewhere: see `middle_weight`.
+If a segment has two crossings, for example at a corner, its ends are equal. Segments with equal ends are therefore also
+probed in the middle. If only the middle differs, the segment also represents segments on which the differing part does
+not cover the middle: see `middle_weight`.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ import mitsuba as mi
 BISECTIONS = 12
 """Number of bisections of a segment: the final interval has 2^-12 of its length."""
 OFF_PLANE = 0.1
-"""Distance of a point from another point's tangent plane, relative to the distance of the two points, above which their
-surface may occlude itself."""
+"""Threshold above which a surface may occlude itself: distance of a point from the tangent plane of another point,
+relative to the distance between the two points."""
 ROUNDING = 1e-5
 """Relative rounding error of the coordinates of points."""
 HIDES, BENDS = 0.25, 0.02
-"""Importance of an edge between two points of one shape, relative to points of two shapes. The lower value applies if
-each point is in front of the other's tangent plane, or each is behind it: most such surfaces are merely curved."""
+"""Importance of an edge between two points of one shape, relative to points of two shapes. BENDS applies if both points
+are in front of each other's tangent plane, or both are behind: most such surfaces are merely curved."""
 ANGLE = 1e-3
 """Smallest angle between two surfaces, in radians, that counts as an edge."""
 CRACK_BISECTIONS = 8
-"""Number of successive bisections with the same fixed end that suggest a crack; of true edges, 1 in 2^7 reaches it."""
+"""Number of successive bisections without a move of the same end that suggest a crack. 1 in 2^7 true edges reaches it.
+"""
 PARTS = 3
 """Number of bisections in each half of a segment that locate the end of the differing part."""
 MIN_FRACTION = 9 / 32
@@ -49,12 +50,12 @@ class VisibilityProbe:
     signature: mi.UInt32
     p: mi.Point3f  # point that is visible; zero if there is none
     n: mi.Normal3f
-    moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # edges between static points are ignored
+    moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # may move; edges between static points are ignored
     # Importance of an adjacent edge, as far as a single probe can estimate it:
     near: mi.Float = field(default_factory=lambda: mi.Float(1))  # reciprocal distance of the visible point
     bright: mi.Float = field(default_factory=lambda: mi.Float(1))  # estimate of the radiance
     # For coarse meshes with smooth shading, where the plane of a triangle may occlude light:
-    triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 1 + its index; 0: irrelevant
+    triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 1 + triangle index; 0: irrelevant
     light: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the emitter sample, or zero
     lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the BSDF sample, or zero
 
@@ -68,7 +69,7 @@ class VisibilityProbe:
         return self.edge_importance(other) > 0
 
     def edge_importance(self, other: VisibilityProbe) -> mi.Float:
-        """Estimate how likely an edge between the probes is, as an importance: 0 if there is certainly none."""
+        """Return the importance of an edge between the probes, a measure of its likelihood; 0 if there is no edge."""
         across = other.p - self.p
         bend = dr.dot(self.n, across) * dr.dot(other.n, across) < 0
         same = dr.select(hides_itself(self, other), dr.select(bend, mi.Float(BENDS), HIDES), 0)
@@ -76,10 +77,10 @@ class VisibilityProbe:
         return dr.select(self.moves | other.moves, importance, 0)
 
     def _crease(self, other: VisibilityProbe) -> mi.Bool:
-        """Return whether the probes see different triangles, and a direction lies between the planes of the two.
+        """Return whether the probes see different triangles with a sampled direction between their planes.
 
-        The occlusion of such a direction by the triangles is discontinuous. Directions close to the planes count, too:
-        up to the crease they turn with the shading normal, by at most the angle between the triangles.
+        The triangles occlude such a direction discontinuously. Directions close to the planes count as well, because
+        they turn with the shading normal up to the crease, by at most the angle between the triangles.
         """
         between = mi.Bool(False)
         for d in (self.light, self.lobe, other.light, other.lobe):
@@ -96,7 +97,8 @@ def at_an_angle(n: mi.Normal3f, n_other: mi.Normal3f) -> mi.Bool:
 def hides_itself(a: VisibilityProbe | mi.SurfaceInteraction3f, b: VisibilityProbe | mi.SurfaceInteraction3f) -> mi.Bool:
     """Return whether two points of one shape may lie on different sheets: one is off the tangent plane of the other.
 
-    The shape may also be curved between the points. Only points that are closer to each other can distinguish the two.
+    The result is also true if the shape is merely curved between the points. Only points that are closer to each other
+    can distinguish curvature from different sheets.
     """
     across = b.p - a.p
     off = dr.maximum(dr.abs(dr.dot(a.n, across)), dr.abs(dr.dot(b.n, across)))
@@ -132,7 +134,7 @@ class Bracket:
 
     a: mi.Float
     b: mi.Float
-    weight: mi.Float  # number of crossings that it represents; 0: no edge
+    weight: mi.Float  # number of crossings that the interval represents; 0: no edge
 
     def per_length(self, length: mi.Float | float, density: mi.Float) -> mi.Float:
         """Return the Crofton weight, π/2 / (l p(c)) per crossing: the length of edge that the interval represents."""
@@ -140,7 +142,7 @@ class Bracket:
 
 
 def crossing_weight(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi.Spectrum:
-    """Return K = jump · sgn(w·∂B) / |∂B|, or zero if that is not finite; ``slope`` is ∂B."""
+    """Return K = jump · sgn(w·∂B) / |∂B|, or zero where K is not finite; ``slope`` is ∂B."""
     n = dr.norm(slope)
     K = jump * (dr.sign(dr.dot(w, slope)) / n)
     return dr.select((n > 0) & dr.all(dr.isfinite(K)), K, 0)
@@ -179,10 +181,10 @@ def detect(probe: Probe, length: mi.Float, active: mi.Bool) -> mi.Float:
 def middle_weight(m: mi.Float) -> mi.Float:
     """Return the weight of a segment whose ends are equal and whose middle differs, on a fraction ``m`` of its length.
 
-    Consider all shifts of the segment along itself. The differing part lies inside it on a fraction 1 - m of its
-    length, and also covers its middle on min(m, 1 - m). The weight is the ratio of the two. The ratio is unbounded for
-    small m. Below `MIN_FRACTION` the weight is a constant with the right mean for parts cut off by a corner, where all
-    m are equally likely.
+    Consider shifts of the segment along its line, in units of its length. The segment contains the differing part for
+    shifts over a range of 1 - m. The differing part also covers the middle for shifts over a range of min(m, 1 - m).
+    The weight is the ratio of the two ranges, which is unbounded for small m. Below `MIN_FRACTION`, the weight is
+    therefore constant. The constant has the right mean for parts cut off by a corner, where all m are equally likely.
     """
     return dr.select(m < MIN_FRACTION, 2 / MIN_FRACTION - 1, dr.select(m < 0.5, (1 - m) / m, 1))
 
@@ -191,9 +193,9 @@ def middle_weight(m: mi.Float) -> mi.Float:
 def middle_fraction(
     probe: Probe, length: mi.Float, at_a: VisibilityProbe, at_b: VisibilityProbe, active: mi.Bool
 ) -> mi.Float:
-    """Return the fraction of a segment, around its middle, that differs from both ends; each side is exact to 1/16.
+    """Return the fraction of a segment, around its middle, that differs from its ends; each half is exact to 1/16.
 
-    This part may contain further edges: it is the set of midpoints for which the segment detects an edge.
+    The differing part is the set of midpoints for which the segment detects an edge, and may contain further edges.
     """
     half = 0.5 * length
     n, fraction, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
@@ -214,10 +216,10 @@ def middle_fraction(
 def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32) -> Bracket:
     """Bisect each segment of non-zero ``weight`` to an interval with an edge, 2^-12 as long as the segment.
 
-    Of several crossings one is selected in proportion to the likelihood of an edge, and represents all of them. If only
-    the middle differs, `middle_weight` applies. The weight becomes 0 where a surface is merely curved, and at cracks
-    between triangles, through which few rays slip. An end of the interval inside a crack never moves, and a probe just
-    beyond it equals the other end.
+    If a segment has several crossings, one is selected in proportion to the likelihood of an edge, and represents all
+    of them. If only the middle differs, `middle_weight` applies. The weight becomes 0 where a surface is merely curved.
+    It also becomes 0 at cracks between triangles, through which few rays slip. A crack is recognised by an end of the
+    interval that never moves, if a probe just beyond this end equals the probe at the other end.
     """
     a, b, _ = probe_positions(length)
     weight = mi.Float(weight)

@@ -1,10 +1,11 @@
-"""Edges: propagate the motion of edges along the paths that see them, to and from the parameters and the camera.
+"""Edges: propagate their motion along the paths that see them, between the parameters or the camera and the image.
 
-An edge is the zero set of a function B(ray, π), and moves with dB/dπ. It contributes to the radiance at film position s
+An edge is the zero set of a function B(ray, π), and moves with dB/dπ. The edge contributes to the derivative of the
+radiance at film position s
 
     - Σ K dB/dπ,
 
-summed over the crossings of boundary segments with the edge. A lane has one crossing in `primary` and `volumetric` and
+summed over the crossings of boundary segments with the edge. A lane has one crossing in `primary` and `volumetric`, and
 up to three in `secondary`. Reverse mode propagates the adjoint of the ray that sees the edge back along the records of
 the path. Forward mode propagates the tangent of the camera ray to the edge.
 """
@@ -36,7 +37,7 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 class FilmDomain(Protocol):
-    """The part of the film on which paths start; positions (Point2f, in pixels) range from its corner to ``size``."""
+    """The part of the film on which paths start. Positions (Point2f, pixels) range from 0 at a corner to ``size``."""
 
     @property
     def size(self) -> mi.ScalarVector2f: ...
@@ -63,7 +64,8 @@ class Crossing(Protocol):
     def gap(self, at: Any) -> mi.Float:
         """Evaluate B, which is zero on the edge. Differentiable in the shapes and in ``at``.
 
-        ``at`` is the observer (`ObserverVertex.moved`) or, if there is none, the ray that slides over the edge.
+        ``at`` is the observer (`ObserverVertex.moved`). Without an observer, ``at`` is the ray that slides over the
+        edge.
         """
 
 
@@ -72,7 +74,7 @@ class EdgePath:
     """The camera path that sees an edge: ``k`` vertices, and the ray from the last vertex to the edge."""
 
     s: mi.Point2f  # film position
-    key: mi.UInt32  # seed of its random numbers
+    key: mi.UInt32  # seed of the path's random numbers
     k: mi.UInt32  # zero without an edge
     ray: mi.Ray3f
     layout: Layout
@@ -101,7 +103,8 @@ def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spe
     with dr.resume_grad():
         ray, _ = film.ray(path.s, path.key)
         if dr.grad_enabled(ray.o, ray.d):
-            # Each camera parameter sums over these values separately. Unevaluated, every sum would repeat the search.
+            # Each camera parameter has a separate sum over these values. Without evaluation, every sum would repeat the
+            # search.
             dr.eval(q, path.s, path.key)
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
 

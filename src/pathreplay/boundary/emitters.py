@@ -38,21 +38,21 @@ from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import TraceConfig, mis_weight
 
 BORDER = 1e-4
-"""Margin of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
+"""Margin of the unit square without segments: some emitters are singular there, for example the cone of a sphere."""
 INSIDE = 1 - 2 * BORDER
 JUMP = 4.0
-"""Largest ratio of the change of B over an interval to the change that its slope predicts. Above it, the interval
-contains a discontinuity of the emitter samples instead of an edge."""
+"""Largest ratio of the change of B over an interval to the change that the slope of B predicts. Above this ratio, the
+interval contains a discontinuity of the emitter samples instead of an edge."""
 
 
 @dataclass
 class SampledEmitter:
-    """An emitter and, for a mesh, its bounding sphere; the radius is 0 for all others."""
+    """An emitter and, for a mesh, its bounding sphere; the radius is 0 for all other emitters."""
 
     ptr: mi.EmitterPtr
     centre: mi.Point3f
     radius: mi.Float
-    polar: mi.Bool  # it samples in polar coordinates: see `sample_at`
+    polar: mi.Bool  # the emitter samples directions in polar coordinates: see `sample_at`
 
     @staticmethod
     def of(trace: TraceConfig, index: mi.UInt32, active: mi.Bool) -> SampledEmitter:
@@ -82,14 +82,14 @@ class EmitterProbe:
 
     light: mi.DirectionSample3f
     Le: mi.Spectrum  # radiance over the density of the position
-    density: mi.Float  # of emitter sampling, in this direction
+    density: mi.Float  # density of emitter sampling in this direction
     ray: mi.Ray3f
-    hit: mi.PreliminaryIntersection3f  # of the shadow ray; a visible mesh emitter is a hit, too
+    hit: mi.PreliminaryIntersection3f  # hit of the shadow ray, which may be the mesh emitter itself
     hidden: mi.Bool
 
 
 def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Bool:
-    # At its silhouette, an emitter occludes itself by rounding only.
+    # An emitter occludes itself only at its silhouette, due to rounding.
     return active & hit.is_valid() & (hit.shape.emitter() != emitter)
 
 
@@ -103,7 +103,7 @@ def sample_at(trace: TraceConfig, emitter: SampledEmitter, u: mi.Point2f) -> mi.
 
 
 def direction(emitter: SampledEmitter, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-    """Return a direction in the cone from o around the bounding sphere, and the cone's solid angle.
+    """Map u to a direction in the cone from o around the bounding sphere, and return the cone's solid angle as well.
 
     If o is inside the sphere, the cone contains all directions. Differentiable in u.
     """
@@ -231,7 +231,7 @@ class EmitterSegment(PlaneSegment):
         a, b = (self.probe_emitter(t, active) for t in (bracket.a, bracket.b))
         active &= a.hidden != b.hidden
         lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
-        active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)  # else the outline of the mesh emitter
+        active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)  # otherwise, the mesh emitter's own outline
         active &= observer.is_far(dark.hit.t)
         f, pdf = observer.towards(lit.light.d, active)
         T = observer.transmittance_past_edge(lit.light, dark.hit.t, self.key, active)
@@ -251,9 +251,9 @@ class ShadowCrossing:
 
     weight: mi.Spectrum
     segment: EmitterSegment
-    u: mi.Point2f  # on the occluded side
+    u: mi.Point2f  # position on the occluded side
     lit: EmitterProbe
-    dark: EmitterProbe  # at u: its ray hits the occluder
+    dark: EmitterProbe  # probe at u, whose ray hits the occluder
     n: mi.Vector3f
     own: mi.Bool  # the occluder is the plane of the observer's own triangle
     active: mi.Bool
@@ -267,11 +267,11 @@ class ShadowCrossing:
         return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, dark.hit, dark.ray, self.active))
 
     def weighted(self, w: mi.Vector2f, u_lit: mi.Point2f) -> ShadowCrossing:
-        """Replace the weight, the jump along ``w``, by K; ``u_lit`` is the emitter sample on the lit side."""
+        """Replace the weight, so far the jump along ``w``, by K; ``u_lit`` is the emitter sample on the lit side."""
         observer, dark = self.segment.observer, self.dark
         at = observer.moved(observer.at.ray)
         slope = derivative_by_place(self.u, lambda u: self._gap(at, u))
-        # At a jump of the emitter samples there is no edge: the lit end is far from the occluded end.
+        # If the emitter samples jump, the lit end is far from the occluded end, and there is no edge.
         off = dr.abs(self._gap(at, u_lit) - self._gap(at, self.u))
         jumps = off > JUMP * dr.norm(slope) * dr.norm(u_lit - self.u) + ROUNDING * (dr.norm(dark.ray.o) + dark.hit.t)
         return replace(self, weight=dr.select(self.active & ~jumps, crossing_weight(w, self.weight, slope), 0))

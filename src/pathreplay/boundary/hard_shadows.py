@@ -20,7 +20,7 @@ from pathreplay.transport.volume.passage import skip_null
 
 @dataclass
 class ShadowTest:
-    """Whether a light reaches a point: an occluder, a projector's image boundary or a spot's cone may prevent it."""
+    """Whether a light reaches a point, which may be occluded or outside a projector's image or a spot's cone."""
 
     u: mi.Point2f  # random numbers that select the light
     lit: mi.Bool  # a light was sampled, and it has no extent
@@ -69,7 +69,7 @@ class HardShadow:
     trace: TraceConfig
     exists: mi.Bool
     in_a: mi.Bool  # the first point is in shadow
-    test: ShadowTest  # of the point in shadow
+    test: ShadowTest  # test of the point in shadow
     n: mi.Vector3f  # normal to the edge of the occluder: see `edge_normal`
 
     @staticmethod

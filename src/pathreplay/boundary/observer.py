@@ -27,7 +27,7 @@ from pathreplay.transport.volume.media import carried, span
 from pathreplay.transport.volume.passage import further, skip_null, transmittance_past_edge, transmittance_up_to
 
 NEAR = 10.0
-"""Smallest usable distance of an edge, in multiples of the ray offset; directions are wrong by at most a tenth."""
+"""Smallest usable distance of an edge, in ray offsets. The offset then changes directions by at most a tenth."""
 
 
 def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool, mi.Spectrum]:
@@ -49,10 +49,10 @@ class SelectedVertex:
     """The vertex of a camera path from which edges are searched."""
 
     at: Arrival
-    k: mi.UInt32  # number of records before
-    depth: mi.UInt32  # number of vertices before, without null boundaries
-    β: mi.Spectrum  # throughput before, over the selection probability
-    mass: mi.Float  # the selection probability is proportional to it
+    k: mi.UInt32  # number of records before the vertex
+    depth: mi.UInt32  # number of vertices before this one, without null boundaries
+    β: mi.Spectrum  # throughput before the vertex, divided by the selection probability
+    mass: mi.Float  # the selection probability is proportional to this value
     moves: mi.Bool  # this or an earlier vertex may move
     active: mi.Bool
     flight: Flight | None = None  # flight to the vertex; None in scenes without media
@@ -65,7 +65,7 @@ def choose_vertex(
     """Trace a camera path, and select one of its smoothly scattering vertices in proportion to the throughput.
 
     Where ``flows``, all vertices may move relative to the film position. Vertices are written to ``records`` unless
-    that is None. The last vertex that ``trace`` allows scatters no light, so the path ends before it.
+    ``records`` is None. The last vertex that ``trace`` allows scatters no light, and is therefore not traced.
     """
     trace = replace(trace, max_depth=max(trace.max_depth - 1, 0))
     path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)))
@@ -119,13 +119,13 @@ class ObserverVertex:
         if trace.media is None:
             self.origin = self.si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
         else:
-            # The flight is known, so that no sampler is asked.
+            # The flight is known, so that no sampler is needed.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # such continuations slide over facets
+        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # then, directions slide over facets
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
-        """Return the vertex with derivatives by the arriving ``ray`` and by the surface or medium: see `fly_again`."""
+        """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium: see `fly_again`."""
         si = met(self.at.hit, ray, self.active)
         if self.flight is None:
             return si
@@ -178,7 +178,10 @@ class ObserverVertex:
         return t > NEAR * mi.math.RayEpsilon * (1 + dr.max(dr.abs(self.origin.p)))
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
-        """Return whether directions follow ``hit``; from a medium, only hits that scatter or emit: see `scatter`."""
+        """Return whether directions from the observer follow ``hit`` when it moves.
+
+        From a medium, directions follow only hits that scatter or emit light: see `scatter`.
+        """
         active = active & ~self.keeps_direction & ~scatter.is_seen_through(self.trace, hit)
         if self.trace.media is None:
             return active
@@ -190,15 +193,15 @@ class ObserverVertex:
         return meet(self.trace, ray, active)
 
     def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-        """Return the hit, or the first hit behind null boundaries."""
+        """Return the first hit of a ray that is not a null boundary; ``hit`` is the first hit of any kind."""
         return hit if self.trace.media is None else skip_null(self.trace, ray, hit, active)
 
     def edge_surfaces(
         self, rays: list[mi.Ray3f], firsts: list[mi.PreliminaryIntersection3f], active: mi.Bool
     ) -> tuple[list[mi.PreliminaryIntersection3f], mi.Bool]:
-        """Return the hits that form the edge between two rays: the first hits, or those behind a common null boundary.
+        """Return the hits that form the edge between two rays, and the mask of lanes with a common null boundary.
 
-        The mask selects the lanes of the second case.
+        The hits are the first hits of the rays or, with a common null boundary, the hits behind this boundary.
         """
         if self.trace.media is None:
             return firsts, mi.Bool(False)
@@ -241,7 +244,10 @@ class ObserverVertex:
     def onward(
         self, arrivals: list[Arrival], t: mi.Float, key: mi.UInt32, active: mi.Bool
     ) -> tuple[mi.Spectrum, list[Arrival]]:
-        """Return the transmittance up to ``t``, and the arrivals along the rest of their rays, in ``active`` lanes."""
+        """Return the transmittance up to ``t``, and the arrivals for the rest of their rays.
+
+        In lanes that are not ``active``, the transmittance is 1, and the arrivals are unchanged.
+        """
         if self.trace.media is None:
             return mi.Spectrum(1), arrivals
         sampler = CounterSampler.stream(key, Stream.TRANSMITTANCE_TO_EDGE)

@@ -47,7 +47,7 @@ class ArcSegment(Arc):
         first = observer.hit(ray, active & observer.may_scatter(ray.d))
         seen = observer.behind(ray, first, active)
         counts, moves = self._counts(seen), x.moves | may_move(trace, seen)
-        close = active & counts  # the surface is evaluated only there
+        close = active & counts  # lanes in which the surface is evaluated
         if trace.media is None:
             close &= moves
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, close)
@@ -75,7 +75,7 @@ class ArcSegment(Arc):
         return dr.select(counts, probe, dark)
 
     def _counts(self, seen: mi.PreliminaryIntersection3f) -> mi.Bool:
-        """Return whether light may come from a hit: at the last vertex of a path, only from emitters."""
+        """Return whether light may come from a hit. If the hit is the last vertex of a path, it must be an emitter."""
         trace = self.observer.trace
         if trace.media is not None:
             return mi.Bool(True)
@@ -145,7 +145,7 @@ class Side:
 
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f  # may be a miss
-    edge: mi.PreliminaryIntersection3f  # hit with the edge: `hit` or, behind a shared null boundary, the next one
+    edge: mi.PreliminaryIntersection3f  # hit at the edge: `hit`, or the next hit if both sides share a null boundary
 
 
 @dataclass
@@ -206,7 +206,7 @@ class MovedSide:
     side: Side
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """Evaluate B = n·d, whose derivative is n·V; at a crease, B of the crease over its slope."""
+        """Evaluate B = n·d, whose derivative is n·V; at a crease, B of the crease divided by its slope."""
         e, hit, lengths = self.edge, self.side.hit, self.edge.observer.trace.traits.tables.blend_lengths
         d, _ = moved_direction(lengths, at, self.side.ray.d, hit, e.observer.holds(hit, e.active))
         ray = mi.Ray3f(at.spawn_ray(dr.detach(d)).o, d)

@@ -1,8 +1,9 @@
 """Primary boundary term: edges on the film, seen directly, in mirrors or through glass.
 
-A camera ray and the delta lobes after it slide over the surfaces that they hit: the film position s is fixed, the
-visible point is not. The radiance f(s) jumps at an edge. If the edge moves, the integral over the film changes by the
-jump times the area that the edge sweeps. Short segments on the film find the edges (see `crofton`). With N segments,
+The film position s of a path is fixed. The camera ray and the rays of the delta lobes that follow therefore slide over
+moving surfaces: the visible point is not fixed. The radiance f(s) jumps at an edge. If the edge moves, the integral
+over the film changes by the jump times the area that the edge sweeps. Short segments on the film find the edges (see
+`crofton`). With N segments,
 
     dI/dπ = - Σ K dB/dπ,    K = π/2 · (f_a - f_b) / (l p(c) N) · sgn(w·∂B/∂s) / |∂B/∂s|,
 
@@ -80,7 +81,7 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         return chain_config(self.trace)
 
     def guided(self, n: int, seed: mi.UInt32) -> PrimarySearch:
-        """See `EdgeSearch`. Pilot segments are twice as long."""
+        """Refine the density with a pilot pass, whose segments are twice as long: see `EdgeSearch`."""
         wide, n_pilot = replace(self, length=2 * self.length), pilot_size(n, self.film.size)
         pilot = wide.draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.FIRST_LOOK.of(seed))
         return replace(self, density=self.density.refined(pilot.c, wide.detect(pilot) * pilot.density))
@@ -116,7 +117,8 @@ class PrimarySearch(FilmSearch[FilmSegment]):
     def _jump(self, split: ChainSplit, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """Estimate f_a - f_b with the same random numbers on both sides. ``ray`` is the camera ray of side a."""
         trace = self.trace
-        # The triangle planes of coarse meshes clip lobes. With steady frames, no other difference remains at a crease.
+        # The triangle planes of coarse meshes clip lobes. With steady frames, the two sides of a crease have no other
+        # difference.
         onward = replace(trace, steady_frames=trace.traits.coarse_meshes and not trace.traits.brushed_meshes)
         sides, T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:

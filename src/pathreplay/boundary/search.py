@@ -1,8 +1,8 @@
 """Edge search, common to all domains: draw segments, detect edges, resample, bisect, weigh and record.
 
 Most segments cross no edge. A first kernel therefore probes all segments. Segments are then resampled by importance,
-and a second kernel resolves a fixed number of them. No lane of it is wasted, and its width is the same in every pass. A
-pilot pass with few segments determines where on the film all others are drawn.
+and a second kernel bisects a fixed number of segments. No lane of the second kernel is wasted, and its width is the
+same in every pass. A pilot pass with few segments determines the density of all other segments on the film.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pathreplay.transport.vertex import TraceConfig
 PILOT_RATIO, PILOT_PER_PIXEL = 8, 2
 """Ratio of segments to pilot segments, and the largest number of pilot segments per pixel."""
 AROUND = 1.0
-"""Segments drawn in the eight neighbours of a pixel with an edge, per segment in the pixel itself."""
+"""Sum of the importances that an edge gives to the eight neighbours of its pixel, relative to the pixel itself."""
 UNREFINED = 0.25
 """Default fraction of segments that keep the previous density: the pilot pass misses some edges."""
 
@@ -39,7 +39,7 @@ class EdgeSearch(ABC, Generic[Segments]):
 
     trace: TraceConfig
     film: FilmDomain
-    density: SegmentDensity  # of the film positions of paths
+    density: SegmentDensity  # density of the film positions of paths
 
     bisection: ClassVar[Stream]  # random stream that selects among the crossings of one segment
 
@@ -76,8 +76,8 @@ class EdgeSearch(ABC, Generic[Segments]):
 class FilmSegment(PlaneSegment):
     """A segment on the film."""
 
-    key: mi.UInt32  # seed of the random numbers that its paths share
-    density: mi.Float  # of its centre, per pixel, times that of all other drawn quantities
+    key: mi.UInt32  # seed of the random numbers that all paths of the segment share
+    density: mi.Float  # density of the centre, per pixel, times the densities of all other drawn quantities
     active: mi.Bool
 
 
@@ -86,7 +86,7 @@ OnFilm = TypeVar("OnFilm", bound=FilmSegment)
 
 @dataclass(frozen=True)
 class FilmSearch(EdgeSearch[OnFilm]):
-    """Edge search by film segments of a ``length`` in pixels."""
+    """Edge search with segments on the film, whose ``length`` is in pixels."""
 
     length: float
 
@@ -107,7 +107,7 @@ class FilmSearch(EdgeSearch[OnFilm]):
 
     @abstractmethod
     def slope(self, segment: OnFilm, edges: Edges) -> mi.Vector2f:
-        """Compute ∂B/∂s, the gradient of B by film position. No parameter receives a gradient."""
+        """Compute ∂B/∂s, where s is the film position. No parameter receives a gradient."""
 
     def detect(self, segments: OnFilm) -> mi.Float:
         return detect(partial(self.probe, segments), segments.length, segments.active) / segments.density
@@ -164,10 +164,11 @@ class SegmentDensity:
         return SegmentDensity(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
     def refined(self, s: mi.Point2f, importance: mi.Float, unrefined: float = UNREFINED) -> SegmentDensity:
-        """Increase the density at and around positions ``s`` of given ``importance``, because edges continue there.
+        """Increase the density at positions ``s`` of given ``importance``, and around them, where edges continue.
 
-        Probabilities are proportional to the square root of the importance in each pixel. This minimises the variance,
-        a sum of (contribution of a segment)² / density. A fraction ``unrefined`` of the segments keeps the old density.
+        Probabilities are proportional to the square root of the importance in each pixel. This choice minimises the
+        variance, a sum of (contribution of a segment)² / density. A fraction ``unrefined`` of the segments keeps the
+        previous density.
         """
         n, c = self.width * self.height, s + self.margin
         counts = dr.zeros(mi.Float, n)

@@ -1,16 +1,17 @@
 """Secondary boundary term: edges seen from surface points and medium events, in direct shadows and in indirect light.
 
 At a scattering vertex x, light arrives from a direction ω. When parameters change, the interior term moves ω with a
-velocity V. An emitter sample follows its random numbers u. Any other sample follows its hit point, to the degree φ (see
-`velocity`), except in narrow lobes, where it keeps its direction (see `keeps_direction`). At an edge the integrand
+velocity V. An emitter sample keeps its random numbers u. Any other sample follows its hit point, to the degree φ (see
+`velocity`). In narrow lobes, a sample keeps its direction instead (see `keeps_direction`). At an edge, the integrand
 jumps from f_near to f_far. The boundary term contains the motion of the edge relative to V:
 
     dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
 
 One vertex of each camera path is selected. Edges are found by short segments (see `crofton`) in the unit square of
 emitter samples, where visibility changes, and by short arcs around BSDF samples, where the visible surface changes.
-Both integrands include their MIS weights, so the two terms add up. The motion of x is propagated along the path. If x
-is static, edges between static surfaces are ignored, and no segment is spent on them.
+The integrands of both kinds of samples include their MIS weights, so that the two boundary terms add up. The motion of
+x is propagated along the path. If x is static, edges between static surfaces are ignored, and no segment is spent on
+such edges.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport.vertex import TraceConfig
 
 UNGUIDED = 0.8
-"""Fraction of the segments that keep the previous density: shadows are also visible through other surfaces."""
+"""Fraction of the segments that keep the previous density, because other surfaces also reflect or transmit shadows."""
 
 
 @dataclass
@@ -43,15 +44,16 @@ class CameraPath:
 
     s: mi.Point2f  # film position
     density: mi.Float  # of s, per pixel
-    key: mi.UInt32  # seed of its random numbers
-    on_arc: mi.Bool  # the lane stands for the arc
+    key: mi.UInt32  # seed of the path's random numbers
+    on_arc: mi.Bool  # the lane represents the arc, otherwise the segment in the square
 
 
 @dataclass(frozen=True)
 class SecondarySearch(EdgeSearch[CameraPath]):
     """Edge search from path vertices, by segments of two ``lengths``: in the unit square, and on arcs (radians).
 
-    The search does not use the adjoint of the image: forward mode does not know it, and would select other segments.
+    The search does not use the adjoint of the image, because forward mode has no adjoint and would select other
+    segments.
     """
 
     lengths: tuple[float, float]
@@ -65,7 +67,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         return SecondarySearch(trace, film, SegmentDensity(int(film.size.x), int(film.size.y), 0.0), lengths)
 
     def guided(self, n: int, seed: mi.UInt32) -> SecondarySearch:
-        """See `EdgeSearch`. Cast shadows determine the density of the pilot segments."""
+        """Refine the density with a pilot pass, whose own density follows cast shadows: see `EdgeSearch`."""
         density = self.density
         if shapes := casters(self.trace):
             s, falls = cast_shadows(self.trace, shapes, self.film, Stream.CAST_SHADOWS.of(seed))
@@ -86,14 +88,14 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         )
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
-        """See `EdgeSearch`. Indices from ``n`` on denote arcs."""
+        """Draw the path of segment ``i``: see `EdgeSearch`. Indices from ``n`` to 2 n - 1 denote arcs."""
         on_arc = i >= n
         i = dr.select(on_arc, i - n, i)
         s, density = self.density.draw(mi.Point2f(quasi_random(i, n, seed)))
         return CameraPath(s, density, key_of(i, Stream.SECONDARY_KEYS.of(seed)), on_arc)
 
     def detect(self, segments: CameraPath) -> mi.Float:
-        """See `EdgeSearch`. Returns all segments in emitter squares first, followed by all arcs."""
+        """Return the importance of all segments in emitter squares, followed by the importance of all arcs."""
         assert self.radiance is not None
         presence, worth = weighed(self._worths(segments), self.radiance)
         return worth + UNFORESEEN * presence

@@ -1,7 +1,7 @@
 """Volumetric boundary term: boundaries of the hard shadows that lights without extent cast into media.
 
-The camera sees points x = o + τ d of a medium at all distances τ. Each x is either lit or in shadow, so there is an
-edge on the film for each τ. Short segments with constant τ find it (see `crofton`), as for hard shadows on surfaces:
+The camera sees points x = o + τ d of a medium at all distances τ. Each x is either lit or in shadow. For each τ, the
+film therefore has an edge, which short segments with constant τ find (see `crofton`), as for hard shadows on surfaces:
 
     dI/dπ = - Σ K dB/dπ,    K = π/2 · f / (l p(c) p(τ) N) · sgn(w·∂B/∂s) / |∂B/∂s|,    B = n·(x + r d - z),
 
@@ -60,7 +60,7 @@ class BeamCrossing:
 
 @dataclass(frozen=True)
 class VolumetricSearch(FilmSearch[BeamSegment]):
-    """Edge search over film positions and distances, without a pilot pass: beams cover much of the image."""
+    """Edge search over film positions and distances, without a pilot pass, because beams cover much of the image."""
 
     bisection = Stream.BISECT_VOLUMETRIC
 
@@ -119,7 +119,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         return skip_null(self.trace, ray, meet(self.trace, ray, active), active)
 
     def _reach(self, ray: mi.Ray3f) -> mi.Float:
-        """Return the largest distance τ on a ray: that of its hit or, if it misses, that of the end of the scene."""
+        """Return the largest distance τ on a ray: the distance of its hit or, without a hit, the end of the scene."""
         hit, box = self._hit(ray, mi.Bool(True)), self.trace.scene.bbox()
         far = dr.norm(ray.o - box.center()) + 0.5 * dr.norm(box.extents())
         return dr.select(hit.is_valid(), hit.t, far)

@@ -1,8 +1,8 @@
-"""Importance of a segment, estimated from its probes. It affects only which segments are resolved, not the mean.
+"""Importance of a segment, estimated from its probes. It determines which segments are bisected, not the mean result.
 
-An edge at distance r turns by 1 / r per unit of motion, and the integrand jumps there by a fraction of the scattered
-radiance. The radiance of a visible surface is unknown before a path is traced: the sky has importance 1, any other
-surface has importance `DIM`.
+An edge at distance r turns by 1 / r per unit of motion, and the integrand jumps at the edge by a fraction of the
+scattered radiance. The radiance of a visible surface is unknown before a path is traced. Instead, the importance is 1
+for the sky, and `DIM` for any other surface.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from pathreplay.transport.vertex import TraceConfig
 WITHIN = 2.0
 """Distance below which importance hardly increases, in `blend_length`s of the visible surface."""
 DIM, OWN = 0.3, 0.1
-"""Importance of an edge where no sky is visible, and where it may be only the plane of the observer's own triangle."""
+"""Importance where no sky is visible (DIM), and where the plane of the observer's own triangle is an edge (OWN)."""
 UNFORESEEN = 0.1
 """Weight of the mere presence of an edge in its importance: probes do not predict every large contribution."""
 MOST = 4.0
-"""Largest importance of a pilot segment, relative to the mean: there are few pilot segments."""
+"""Largest importance of a pilot segment, relative to the mean. It is bounded because there are few pilot segments."""
 STEEP = 0.03
 """Smallest assumed angle of an emitter across its square, in radians: it bounds the importance of small emitters."""
 
@@ -60,7 +60,7 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
 
 
 def radiance_of(worths: list[Worth]) -> mi.Float:
-    """Estimate the mean radiance seen by arcs: the ratio of scattered emitter light to their scattering weights."""
+    """Estimate the mean radiance seen by arcs: scattered emitter light, divided by the arcs' scattering weights."""
     from_emitters, total = (dr.sum(worth.light) for worth in worths)
     return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
 

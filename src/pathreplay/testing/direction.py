@@ -136,6 +136,6 @@ def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
             return FORWARD
         if (value - 2 * move >= 0).all():
             return BACKWARD
-    # Also if both one-sided stencils reach negative values (a given direction of mixed signs at zeros). Linear parameters
-    # tolerate negative values.
+    # Also if both one-sided stencils reach negative values, as with a given direction of mixed signs at zeros. Linear
+    # parameters tolerate negative values.
     return CENTRAL

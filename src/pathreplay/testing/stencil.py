@@ -36,6 +36,6 @@ CENTRAL = Stencil("central", ((-1, -0.5), (1, 0.5)))
 FORWARD = Stencil("one-sided, up", ((0, -1.5), (1, 2), (2, -0.5)))
 BACKWARD = Stencil("one-sided, down", ((0, 1.5), (-1, -2), (-2, 0.5)))
 # Stencils of fourth and third order, for steps that are a large fraction of the parameter. Delta tracking makes new
-# random decisions at every h. The noise of a difference therefore does not decrease with h, as it does for smooth paths.
+# random decisions at every h. Unlike for smooth paths, the noise of a difference therefore does not decrease with h.
 WIDE = Stencil("wide", ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12)))
 UPWARD = Stencil("wide, up", ((0, -11 / 6), (1, 3), (2, -1.5), (3, 1 / 3)))
