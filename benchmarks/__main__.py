@@ -75,7 +75,7 @@ def main(
 ) -> None:
     """Compare gradients with Mitsuba's own; `report` writes saved records into docs/evidence.md and its figures.
 
-    An interrupted run continues where it was when it is started again.
+    An interrupted run continues where it stopped when it is started again.
     """
     wanted = tasks or []
     folder = into or (records.RESULTS if save else None)

@@ -4,8 +4,8 @@
 
 The command runs a job in one process (`deterministic = true`), then by Ray actors. During the second run it kills
 (SIGKILL) a random actor at random moments, ``--kills`` times in all, and prints the log of the run. The exit status is
-1 if any byte of the results differs, or if the run ended before all kills were done, which needs more ``--iterations``.
-It takes about three minutes on two quiet cores, and needs `pip install 'pathreplay[ray]'`.
+1 if any byte of the results differs, or if the run ended before all kills were done. In the second case, use more
+``--iterations``. The command takes about three minutes on two quiet cores, and needs `pip install 'pathreplay[ray]'`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def main(
     iterations: Annotated[int, typer.Option(help="Iterations of each of the two stages.")] = 800,
     seed: Annotated[int, typer.Option(help="Seed of the moments and of the choice of actors.")] = 0,
 ) -> None:
-    """Kill actors of a run, and compare the results."""
+    """Run a job with and without kills of its actors, and compare the results."""
     stages = [{**stage, "iterations": iterations} for stage in JOB["stages"]]
     job: dict[str, Any] = {**JOB, "stages": stages, "checkpoint_every": iterations, "spp_shards": 2}
     with tempfile.TemporaryDirectory() as name:

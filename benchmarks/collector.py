@@ -2,8 +2,8 @@
 
     python -m benchmarks.collector
 
-The command prints the time of the context manager alone, and the share of the cyclic garbage collector in recorded
-passes. A full collection in each pass would traverse all objects.
+The command prints the time of the context manager alone, and the fraction of the time of recorded passes that the
+cyclic garbage collector takes. A full collection in each pass would traverse all objects.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The regression check: finds what became slower, noisier, larger or wrong between two records of a task.
 
-Absolute times differ between days and machines. So the check compares ratios to Mitsuba's method of the same job in the
-same run, if both records have it. A change counts if its 95 % bootstrap interval lies outside a margin.
+Absolute times differ between days and machines. The check therefore compares ratios to Mitsuba's method in the same job
+of the same run, if both records contain this method. A change counts if its 95 % bootstrap interval lies outside a
+margin.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Comparison:
 
 
 def compare(old: Record, new: Record) -> Comparison:
-    """Compare two records of a task; Mitsuba's own methods are the reference and not judged."""
+    """Compare two records of a task. Mitsuba's own methods serve as the reference and are not judged."""
     before, now = ({_key(point): point for point in pooled(record.points)} for record in (old, new))
     same_machine = _place(old.machines) == _place(new.machines)
     rows: list[Row] = []

@@ -18,7 +18,7 @@ DRAFTS = ROOT / "benchmarks" / "results" / ".partial"
 
 @dataclass(frozen=True)
 class Done:
-    """A finished job; ``turn`` is its index among equal jobs, since a task may repeat a job."""
+    """A finished job. A task may repeat a job; ``turn`` is the index among equal jobs."""
 
     job: Job
     turn: int
@@ -88,7 +88,7 @@ class Draft:
 
 
 def draft_of(task: str, quick: bool) -> Draft:
-    """The draft of a task, with the jobs of an interrupted run if any."""
+    """The draft of a task, with the finished jobs of an interrupted run if there are any."""
     return Draft(DRAFTS / f"{task}{'-quick' if quick else ''}.json")
 
 

@@ -2,8 +2,9 @@
 
     python -m benchmarks.edges_mesh
 
-The command runs examples/mesh-by-shadows and prints root mean square distances of the initial and the final mesh: from
-its vertices to the true surface, and from points of the true surface to its vertices. The body has length 1.
+The command runs examples/mesh-by-shadows and prints root mean square distances for the initial and the final mesh: from
+the vertices of the mesh to the true surface, and from points of the true surface to the vertices. The length of the
+body is 1.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
-"""Tests that a run that is killed at a random moment can be resumed, and ends with the same bytes.
+"""Tests that a run killed at a random moment can be resumed, and ends with the same bytes as an undisturbed run.
 
     python -m benchmarks.kills [--kills 100] [--seed 0]
 
 The command runs a small job in one thread (`deterministic = true`) undisturbed. Then it kills (SIGKILL) ``--kills``
-runs of the job, each at a random moment between shortly before the creation of its run folder and its end. A killed run
-is resumed with `--resume`, or started again if nothing was saved. The command prints a table and all differences; the
-exit status is 1 if there are any. 100 kills take about a quarter of an hour on a quiet core.
+runs of the job, each at a random moment. These moments lie between shortly before the creation of the run folder and
+the end of the run. A killed run is resumed with `--resume`, or started again if nothing was saved. The command prints a
+table and all differences. The exit status is 1 if there are differences. 100 kills take about a quarter of an hour on a
+quiet core.
 """
 
 from __future__ import annotations

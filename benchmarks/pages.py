@@ -1,4 +1,4 @@
-"""Updates the pages: figures and tables between markers are generated from the records in benchmarks/results/."""
+"""Updates figures and tables between the markers of pages, from the records in benchmarks/results/."""
 
 from __future__ import annotations
 

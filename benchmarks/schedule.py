@@ -26,7 +26,7 @@ DEVICES, PARAMETERS = (1, 10, 100, 1000), (10**6, 10**7, 10**8, 10**9)
 BYTES = 4
 """Bytes of a value, and of an entry of a gradient."""
 STEPS, COUNTED = 12, 8
-"""Steps of a simulation, and how many at its end count: in the first steps no durations are known."""
+"""Steps of a simulation, and number of last steps that count. In the first steps, no durations are known."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class Costs:
 def built(costs: Costs, shards: int, devices: int, parameters: float) -> float:
     """Seconds of a step of a job: values are broadcast along a tree, and one process sums all gradients and steps.
 
-    Gradients are fetched while other shards are computed, so the longer of the two counts, plus one of the other.
+    Gradients are fetched while other shards are computed. The time of both is therefore the maximum of two sums: all
+    computing plus one fetch, or the computing of one shard plus all fetches.
     """
     out = np.ceil(np.log2(devices + 1)) * costs.send(parameters) if devices > 1 else 0.0
     one_back = (costs.send(parameters) if devices > 1 else 0.0) + costs.add * parameters

@@ -1,4 +1,4 @@
-"""Short tables for overview pages, which mark their place by `<!-- begin TASK-summary -->`."""
+"""Short tables for overview pages, in which `<!-- begin TASK-summary -->` marks the place of a table."""
 
 from __future__ import annotations
 

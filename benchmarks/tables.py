@@ -47,7 +47,7 @@ def groups(points: Iterable[Point]) -> dict[Turns, dict[str, Point]]:
 
 
 def pooled(points: Iterable[Point]) -> list[Point]:
-    """Merge the points of repeated jobs: seconds are joined; gradient errors are equal, since the seeds are."""
+    """Merge the points of repeated jobs by joining their seconds. Gradient errors are equal, as the seeds are."""
     merged: dict[tuple[object, ...], Point] = {}
     for point in points:
         key = (point.scene, point.parameters, point.method, point.max_depth, point.paths, point.measure)
@@ -69,7 +69,7 @@ def time_cells(point: Point, baseline: Point | None) -> list[str]:
 
 
 def comparison(point: Point, baseline: Point | None) -> list[str]:
-    """Cells: those of `time_cells`, then variance and time x variance relative to a baseline."""
+    """Cells: the cells of `time_cells`, then variance and time x variance relative to a baseline."""
     times = time_cells(point, baseline)
     # Either both have squared errors, or, after a single round, neither.
     if point.error or baseline is None or baseline is point or not (point.squared_errors and baseline.squared_errors):
@@ -79,7 +79,7 @@ def comparison(point: Point, baseline: Point | None) -> list[str]:
 
 
 def brief_footnote(record: Record) -> str:
-    """Command and date, for summaries; pages with the full tables have the other circumstances."""
+    """Command and date of the measurement, for summaries. Pages with full tables use `footnote`."""
     return f"`{record.command}`, {record.date[:10]}."
 
 

@@ -1,7 +1,7 @@
 """The optimization loops of Mitsuba's tutorials with their settings, for the scenes in examples/tutorials.
 
-Each function loads a scene, renders the targets, calls ``ready``, which starts the clock, and returns the final values
-by key. ``few`` replaces the number of iterations, for trials.
+Each function loads a scene, renders the targets, calls ``ready`` to start the clock, optimises, and returns the final
+values by key. ``few`` replaces the number of iterations, for trials.
 """
 
 from __future__ import annotations

@@ -3,12 +3,12 @@
     python -m benchmarks.tutorials [NAME ...] [--quick] [--scenes FOLDER]
 
 The command prints a table: final errors of parameter and image, seconds of all iterations (including kernel tracing,
-without loading and rendering targets), and lines of code. The scenes are those of examples/tutorials; with --scenes,
-the folder `scenes` of mitsuba-tutorials, their meshes, volume and sky replace ours. --quick runs few iterations, as a
-test. Dr.Jit caches compiled kernels on disk, so run it twice for comparable times.
+without loading and rendering targets), and lines of code. The scenes are in examples/tutorials. If --scenes gives the
+folder `scenes` of mitsuba-tutorials, the meshes, volume and sky of that folder replace ours. --quick runs few
+iterations, as a test. Dr.Jit caches compiled kernels on disk: run the command twice for comparable times.
 
 Image errors exclude render noise; they need two renderings of each view and two of its target (by `path` or `volpath`).
-Lines of code are those of the loop without its head, and of the config, without empty lines and comments.
+Lines of code are counted for the loop without its head, and for the config, without empty lines and comments.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""How it is measured: what a job says, the process that runs it, passes of every kind, and what their samples tell."""
+"""Measurements: the definition of jobs, the worker process, the measured passes, and statistics of their samples."""

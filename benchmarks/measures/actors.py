@@ -1,4 +1,4 @@
-"""Iterations of a job with many views, by this process and by actors of Ray, which have one thread each."""
+"""Times iterations of a job with many views, in this process and with Ray actors of one thread each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .job import Job, Measure
 
 PROCESS = "this process"
 COMPILING = {"surfaces": 6, "cloud": 1}
-"""Iterations: kernels are traced, then recorded; an actor that takes a view of another does both once more."""
+"""Number of first iterations that are not timed: kernels are traced and recorded, again on actors that change views."""
 
 SENSOR = """<sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">
   <rotate y="1" angle="{angle}"/><lookat origin="0,2,4" target="0,0,0" up="0,1,0"/></transform>
@@ -29,17 +29,17 @@ ROOM = """<scene version="3.0.0">{sensors}
 
 
 def many(actors: int) -> str:
-    """The method of so many actors."""
+    """Return the name of the method that uses this number of actors."""
     return f"{actors} {'actor' if actors == 1 else 'actors'}"
 
 
 def name_of(scene: str, views: int) -> str:
-    """The name of a job: `surfaces` recovers a floor (passes are recorded), `cloud` a density (they are not)."""
+    """Return the name of a job: `surfaces` recovers a floor with recorded passes, `cloud` a density without them."""
     return f"{scene}, {views} views"
 
 
 class Iterations(Measure):
-    """A run by a method in each round. The first iterations compile and record kernels, and are not counted."""
+    """Run the job once with a method in each round. The first iterations compile and record, and are not counted."""
 
     ITERATIONS = 20
 
@@ -49,14 +49,14 @@ class Iterations(Measure):
         self.seconds: dict[str, list[float]] = {}
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds of the median iteration, and the last loss."""
+        """Return the median of the seconds of an iteration, and the last loss."""
         seconds, loss = self._run({} if method == PROCESS else _ray(int(method.split()[0])))
         counted = seconds[COMPILING[self.scene] :]
         self.seconds.setdefault(method, []).extend(counted)
         return float(np.median(counted)), np.array([loss])
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """Seconds of each iteration that counts."""
+        """Return the seconds of all counted iterations, by method."""
         return {name: {"values": tuple(self.seconds[name])} for name in kept}
 
     def _run(self, executor: dict[str, Any]) -> tuple[list[float], float]:

@@ -1,4 +1,4 @@
-"""A phase function that counts how often it is sampled: the number of real events, measured and not deduced."""
+"""A phase function that counts its samples, to measure the number of real events instead of deducing it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import mitsuba as mi
 
 
 def register() -> type:
-    """Register `countingphase`, isotropic, for the active variant. The class that is returned holds the ``count``."""
+    """Register the isotropic `countingphase` for the active variant; return its class with the counter ``count``."""
 
     class CountingPhase(mi.PhaseFunction):  # type: ignore[misc]
         count = dr.zeros(mi.UInt32, 1)  # of all instances

@@ -1,4 +1,4 @@
-"""One derivative by finite differences and by several methods, as samples of one number: what `truth` measures."""
+"""Samples of one derivative, by finite differences and by several gradient methods, for the task `truth`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PICTURE, DERIVATIVE, REFERENCE, SCALE = range(4)
 
 
 class Derivative:
-    """The derivative of a cell: each call takes one sample of it, with seeds that no other method or call has."""
+    """The derivative of a cell. Each call takes one sample, with seeds that no other call or method uses."""
 
     def __init__(self, job: Job) -> None:
         self.job, self.cell = job, CELLS[job.scene]
@@ -43,11 +43,11 @@ class Derivative:
         self.integrators: dict[str, Any] = {}
 
     def forget(self) -> None:
-        """Make all integrators anew."""
+        """Discard all integrators, so that the next pass creates new ones."""
         self.integrators.clear()
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds and the sample: of two images with common random numbers, or of one gradient pass."""
+        """Return seconds and a sample: a difference of images with common random numbers, or one gradient pass."""
         gc.collect()
         dr.sync_thread()
         start = time.perf_counter()
@@ -71,7 +71,7 @@ class Derivative:
         return self.objective.dot(difference)
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """The samples of each method, and the verdict on it: see pathreplay.testing.verdict."""
+        """Return the samples of each method, and the verdict on the method: see pathreplay.testing.verdict."""
         samples = {name: np.concatenate(rows) for name, rows in kept.items() if rows}
         facts: dict[str, dict[str, Any]] = {
             name: {"values": values.tolist(), "mean": float(values.mean())} for name, values in samples.items()

@@ -1,6 +1,6 @@
-"""One derivative by what moves in a scene, in parts or beside a finite difference: what task `edges` measures.
+"""Times one derivative with respect to a motion, by term or beside finite differences, for the task `edges`.
 
-Seconds are those of kernels, as Dr.Jit keeps them, for a method by itself; of the clock, for one that is `recorded`.
+`EdgePass` measures seconds of kernels from Dr.Jit's kernel history, and wall-clock seconds for `recorded` methods.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Nothing:
 
 
 class EdgePass:
-    """Each call runs one gradient pass by an angle, of the image weighted by a wave: see `job.Measure`."""
+    """Each call differentiates a weighted image with respect to an angle, in one gradient pass: see `job.Measure`."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -71,13 +71,13 @@ class EdgePass:
         self.forget()
 
     def forget(self) -> None:
-        """Make all integrators anew, and record anew."""
+        """Discard all integrators and recordings."""
         self.integrators: dict[str, Any] = {}
         self.recordings = {name: Recordings() for name in self.job.methods}
         self.passes = dict.fromkeys(self.job.methods, 0)
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds, and the derivative."""
+        """Return seconds and the derivative."""
         name, way = parts(method)
         integrator = self._integrator(name)
         t = dr.opaque(mi.Float, 0)
@@ -95,7 +95,10 @@ class EdgePass:
         integrator.render_backward(self.scene, self.params, adjoint, seed=seed, spp=self.job.spp)
 
     def _step(self, method: str, integrator: Any, seed: int) -> Any:
-        """Image, loss and gradient, as an optimiser wants them. Recorded in the second pass, launched in the others."""
+        """Compute image, loss and gradient, as an optimiser does.
+
+        For a `recorded` method, the second pass is recorded, and later passes launch the recorded kernels.
+        """
         records = parts(method)[1] == RECORDED and self.passes[method] > 0
         self.passes[method] += 1
         run = self.recordings[method].differentiate if records else differentiate
@@ -119,10 +122,11 @@ class EdgePass:
 
 
 class NumberPass:
-    """Each call gives the derivative by one number, of the image weighted by a wave: see `job.Measure`.
+    """Each call differentiates a weighted image with respect to one number: see `job.Measure`.
 
-    A gradient pass has ``job.spp`` samples a pixel, and so has each of the two pictures of a central difference, whose
-    random numbers are the same. Both are as people have them: ours with its own numbers, pictures by Mitsuba's `path`.
+    A gradient pass has ``job.spp`` samples per pixel. A central difference uses two images with ``job.spp`` samples per
+    pixel each and common random numbers. Both methods use their usual settings: `pathreplay` its own samples, and the
+    images Mitsuba's `path`.
     """
 
     def __init__(self, job: Job) -> None:
@@ -134,14 +138,14 @@ class NumberPass:
         self.forget()
 
     def forget(self) -> None:
-        """Make all integrators anew."""
+        """Create all integrators again."""
         self.integrators: dict[str, Any] = {
             name: mi.load_dict((PICTURES if name == DIFFERENCE else METHODS[name]) | self.job.limits)
             for name in self.job.methods
         }
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds by the clock, and the derivative."""
+        """Return wall-clock seconds and the derivative."""
         run = self._difference if method == DIFFERENCE else self.objective.backward
         seconds, value = stopwatch(lambda: run(self.integrators[method], seed, self.job.spp))
         return seconds, np.array([value])
@@ -156,7 +160,7 @@ class NumberPass:
 
 
 def kernel_seconds(run: Callable[[], Any]) -> float:
-    """Seconds of all kernels that it launches."""
+    """Return the seconds of all kernels that ``run`` launches."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.sync_thread()
         dr.kernel_history_clear()

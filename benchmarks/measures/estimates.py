@@ -28,7 +28,7 @@ class Estimate:
 
 
 def interval(statistic: Callable[..., np.ndarray], *samples: Sequence[float] | np.ndarray, paired: bool) -> Estimate:
-    """The statistic of the samples; bootstrap over rounds or seeds, the same ones of all samples if they are paired."""
+    """Return a statistic with a bootstrap interval over rounds; ``paired`` samples are resampled by the same rounds."""
     found = bootstrap(
         samples, statistic, paired=paired, n_resamples=RESAMPLES, method="percentile", vectorized=True, random_state=0
     ).confidence_interval
@@ -36,34 +36,34 @@ def interval(statistic: Callable[..., np.ndarray], *samples: Sequence[float] | n
 
 
 def mean_ratio(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
-    """Ratio of the means, of the same rounds on both sides."""
+    """Return the ratio of the means of samples from the same rounds."""
     return interval(lambda a, b, axis: a.mean(axis) / b.mean(axis), ours, theirs, paired=True)
 
 
 def unpaired_ratio(
     above: Sequence[float] | np.ndarray, below: Sequence[float] | np.ndarray, centre: Callable[..., np.ndarray]
 ) -> Estimate:
-    """Ratio of the medians (or means) of samples that were not taken in the same rounds."""
+    """Return the ratio of the medians (or means) of samples that were not taken in the same rounds."""
     return interval(lambda a, b, axis: centre(a, axis=axis) / centre(b, axis=axis), above, below, paired=False)
 
 
 @dataclass(frozen=True)
 class Versus:
-    """A method relative to a baseline that it took turns with."""
+    """A method relative to a baseline that was measured in alternation with it."""
 
     ours: Point
     baseline: Point
 
     def time(self) -> Estimate:
-        """Median over rounds of (our seconds) / (their seconds of the same round)."""
+        """Return the median over rounds of our seconds / the baseline's seconds in the same round."""
         return interval(np.median, np.divide(self.ours.seconds, self.baseline.seconds), paired=True)
 
     def variance(self) -> Estimate:
-        """Ratio of the means of squared errors."""
+        """Return the ratio of the mean squared errors."""
         return mean_ratio(self.ours.squared_errors, self.baseline.squared_errors)
 
     def cost(self) -> Estimate:
-        """Time ratio x variance ratio: the time for equal variance."""
+        """Return time ratio x variance ratio, the time ratio at equal variance."""
 
         def cost(times: np.ndarray, a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
             return np.median(times, axis) * a.mean(axis) / b.mean(axis)
@@ -72,9 +72,9 @@ class Versus:
         return interval(cost, times, self.ours.squared_errors, self.baseline.squared_errors, paired=True)
 
     def efficiency(self) -> Estimate:
-        """How many times less (time x variance) we need than they do.
+        """Return (time x variance) of the baseline over (time x variance) of our method.
 
-        Sums over all rounds on both sides, not medians: a method that learns pays for its first passes.
+        Uses sums over all rounds instead of medians, so that a method that learns is charged for its first passes.
         """
 
         def gain(t: np.ndarray, a: np.ndarray, u: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
@@ -86,9 +86,10 @@ class Versus:
 
 
 def bias_share(bias_products: Sequence[float], squared_errors: Sequence[float]) -> Estimate:
-    """|bias|² over the variance of one pass: its inverse is how many passes it takes until bias outweighs noise.
+    """Return |bias|² over the variance of one pass. Its inverse is the number of passes after which bias exceeds noise.
 
-    +- 1.96 standard errors of a U-statistic of order two (2 s / sqrt(n)), which are too wide where there is no bias.
+    The interval is +- 1.96 standard errors of a U-statistic of order two (2 s / sqrt(n)). It is too wide where there is
+    no bias.
     """
     products, variance = np.asarray(bias_products), float(np.mean(squared_errors))
     value = float(products.mean()) / variance
@@ -97,10 +98,10 @@ def bias_share(bias_products: Sequence[float], squared_errors: Sequence[float]) 
 
 
 def growth(sizes: Sequence[float], seconds: Sequence[float]) -> Estimate:
-    """Exponent p of  seconds = a + b sizes^p,  a, b >= 0: least squares of the logarithms, +- 1.96 standard errors.
+    """Fit  seconds = a + b sizes^p,  a, b >= 0, and return the exponent p with +- 1.96 standard errors.
 
-    The offset a is what a pass costs however short its paths are: tracing and launching the kernel. It takes at least
-    five sizes to tell the two apart.
+    The fit minimises the squares of the differences of logarithms. The offset a is the cost of tracing and launching
+    the kernel, which does not depend on path length. Separating both terms requires at least five sizes.
     """
     n, t = np.asarray(sizes, dtype=float), np.asarray(seconds, dtype=float)
     if len(n) < 5:

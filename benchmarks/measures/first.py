@@ -1,7 +1,8 @@
-"""One process from its start to its second gradient: prints the seconds of each stage as one JSON list.
+"""Times one process from its start to its second gradient, and prints the seconds of each stage as one JSON list.
 
-Started by `start.py` as `python -m benchmarks.measures.first JOB`, whose one method is an integrator. For Mitsuba's own
-pathreplay is not imported, nor anything else that they do not need: they are measured as their users have them.
+`start.py` runs `python -m benchmarks.measures.first JOB`, where the only method of JOB is an integrator. To measure
+Mitsuba's integrators as their users run them, the process then imports neither pathreplay nor anything else that they
+do not need.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ def _set_variant(ours: bool) -> None:
 
 
 def main(text: str) -> list[float]:
-    """Seconds of: import and variant; scene, integrator and first gradient; second gradient, with another seed."""
+    """Return the seconds of three stages: import and variant; scene and first gradient; second gradient."""
     (method,) = json.loads(text)["methods"]
     _set_variant(method not in STOCK)
     imported = time.perf_counter()

@@ -1,6 +1,6 @@
-"""Flights through a grid, and estimates of its transmittance: what `gridmedium` measures.
+"""Measures flights through a density grid and estimates of its transmittance, for the task `gridmedium`.
 
-Seconds are CPU time, since it counts all threads and hardly feels what else the machine does.
+Seconds are CPU time, which includes all threads and hardly depends on the load of the machine.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAJORANTS: dict[str, str | bool] = {"one majorant": False, "auto": "auto", "cell
 
 
 class Flight(Measure):
-    """Delta tracking to the first real collision, along lines through the cube: time, and tentative collisions."""
+    """Time and number of tentative collisions of delta tracking to the first real collision, along lines."""
 
     def __init__(self, job: Job) -> None:
         self.rays = job.resolution**2 * job.spp
@@ -34,7 +34,7 @@ class Flight(Measure):
         self.ray = _lines(self.rays)
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """CPU seconds, and tentative collisions a ray."""
+        """Return CPU seconds, and the number of tentative collisions per ray."""
 
         def run() -> tuple[Any, Any]:
             return _first_collision(self.grids[method], self.ray, _sampler(seed, self.rays))
@@ -43,14 +43,14 @@ class Flight(Measure):
         return seconds, np.array(dr.mean(mi.Float(count)))
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """Tentative collisions a ray."""
+        """Return the mean number of tentative collisions per ray, by method."""
         return {name: {"mean": float(np.mean(rows))} for name, rows in kept.items()}
 
 
 class Transmittance(Measure):
-    """Estimates of it along shadow rays, next to a quadrature: squared error and time.
+    """Time and squared error of transmittance estimates along shadow rays, relative to a quadrature.
 
-    The rays start at points of the medium, drawn in proportion to the density, in all directions.
+    The rays start in all directions from points of the medium, which are drawn in proportion to the density.
     """
 
     def __init__(self, job: Job) -> None:
@@ -61,14 +61,14 @@ class Transmittance(Measure):
         self.right = _quadrature(self.grid, self.ray)
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """CPU seconds, and the error of each ray."""
+        """Return CPU seconds, and the error of each ray."""
         self.grid.shadow_cells = self.cells[method]
         run = lambda: self.grid.transmittance(self.ray, _sampler(seed, self.rays))  # noqa: E731
         seconds, found = stopwatch(run, time.process_time)
         return seconds, np.array(found, dtype=np.float64)[0] - self.right
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """Squared errors, and the mean error in standard errors."""
+        """Return the squared errors, and the mean error in standard errors, by method."""
         found = {name: np.stack(rows) for name, rows in kept.items() if rows}
         return {
             name: {

@@ -1,4 +1,4 @@
-"""What is measured and what comes back: the records that pass between the command, the workers and the files."""
+"""Data classes of jobs and results, which the command, the workers and the files exchange."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ Kind = Literal[
 
 @dataclass(frozen=True)
 class Job:
-    """Passes of some methods on one scene, in turn (A B C A B C ...), in one process: all that a worker is told.
+    """The complete input of a worker: passes of some methods on one scene, in alternation (A B C A B C ...).
 
-    Scenes are named in `benchmarks.scenes`, methods in `methods.py` or where the measure is; a name is all there is.
+    Scenes and methods are given by name: see `benchmarks.scenes`, `methods.py` and the module of the measure.
 
-    Round k of every method has the seed k. ``warmup`` rounds before the first compile the kernels and are not kept;
-    after them all integrators are made anew, and again every ``restart`` rounds: what a method learns from its passes
-    it learns in rounds that are kept.
+    Round k of every method has the seed k. The first ``warmup`` rounds compile the kernels and are discarded. After
+    these rounds, and after every ``restart`` further rounds, all integrators are created again. Everything that a
+    method learns from its passes is thereby learned in rounds that are kept.
     """
 
     scene: str
@@ -60,40 +60,40 @@ class Job:
 
     @property
     def passes(self) -> int:
-        """Passes in all, for the progress bar."""
+        """Total number of passes, for the progress bar."""
         return (self.rounds + self.warmup) * len(self.methods)
 
     @property
     def limits(self) -> dict[str, int]:
-        """What every integrator is given."""
+        """Path limits of all integrators, as plugin properties."""
         return {"max_depth": self.max_depth, "rr_depth": self.rr_depth}
 
     def encode(self) -> str:
-        """The job as one argument of a command; `decode` reads it."""
+        """Return the job as one command-line argument, which `decode` reads."""
         return json.dumps(asdict(self))
 
     @staticmethod
     def decode(text: str) -> Job:
-        """The job that was encoded."""
+        """Return the job that `encode` has written."""
         return Job(**{name: tuple(fact) if isinstance(fact, list) else fact for name, fact in json.loads(text).items()})
 
 
 class Measure(Protocol):
-    """What runs the passes of a job, made from the job."""
+    """Runs the passes of the job from which it is constructed."""
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds of one pass and what came of it, as one flat array; raises what the method raises."""
+        """Run one pass; return its seconds, and its result as one flat array. Errors of the method are raised."""
 
     def forget(self) -> None:
-        """Begin anew: what the methods have learned is gone. Nothing is to be done where they do not learn."""
+        """Discard everything that the methods have learned. Does nothing for methods that do not learn."""
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """By method: fields of `Point` that follow from the arrays of all rounds together."""
+        """Return the fields of `Point` that are computed from the results of all rounds, by method."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One method in one job: every sample, or why there is none."""
+    """The samples of one method in one job, or the error message of the method."""
 
     scene: str
     parameters: tuple[str, ...]
@@ -122,7 +122,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Machine:
-    """Where and with what a worker ran."""
+    """Hardware and software versions of a worker."""
 
     processor: str
     processors: int  # that the process may use
@@ -138,7 +138,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class Record:
-    """One run of a task: what a file under benchmarks/results/ holds."""
+    """One run of a task, the content of a file in benchmarks/results/."""
 
     task: str
     command: str

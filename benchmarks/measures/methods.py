@@ -1,6 +1,7 @@
-"""What is compared: integrators, and ways to use one, by the names that the tables give them.
+"""The compared methods: integrators, and ways to use an integrator, by their names in the tables.
 
-A method is the name of an integrator, or that and a way: `sweep`, `prb, own loop`. It imports nothing: see `first.py`.
+A method is the name of an integrator, optionally followed by a way of using it: `sweep`, or `prb, own loop`. This
+module imports nothing, because `first.py` times imports.
 """
 
 #: What `mi.load_dict` makes of it. One that does not load is a row that says so. Ours draw the numbers that Mitsuba's
@@ -54,6 +55,6 @@ STAGES = ("import", "first gradient", "second gradient")
 
 
 def parts(method: str) -> tuple[str, str]:
-    """Integrator and way, the latter empty where there is none."""
+    """Split the name of a method into integrator and way; the way is empty if there is none."""
     integrator, _, way = method.partition(", ")
     return integrator, way

@@ -1,4 +1,4 @@
-"""Gradient passes and images of a scene, timed: what most tasks measure."""
+"""Times gradient passes and images of a scene, for most tasks."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Pass(SceneMeasure):
         self.grid = getattr(self.params[job.parameters[0]], "shape", ()) if len(job.parameters) == 1 else ()
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds, and the gradients of all parameters (or image, or event count) as one flat array.
+        """Run one pass; return seconds, and the gradients (or the image, or the event count) as one flat array.
 
-        Raises what the method raises.
+        Errors of the method are raised.
         """
         integrator = self.integrator(method)
         self.renew()
@@ -54,7 +54,7 @@ class Pass(SceneMeasure):
         return [dr.grad(leaf) for leaf in self.leaves.values()]
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """What the gradients of all seeds say, by method: see `spread`."""
+        """Return statistics of the gradients over all seeds, by method: see `spread`."""
         return spreads(kept, self.job.reference, self.grid)
 
 

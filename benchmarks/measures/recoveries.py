@@ -1,4 +1,4 @@
-"""Other ways to recover ray adjoints than the replay driver's, which experiments compare it with."""
+"""Other ways to recover ray adjoints, for comparison with the method of the replay driver."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ from pathreplay.adjoint.ray_jacobian import Recovery
 
 @dataclass(frozen=True)
 class OtherRecovery(Recovery):
-    """A + ε X with X the identity at all vertices (``everywhere``), as published, or where a smooth lobe was sampled
-    (``smooth``); ``directions`` is the driver's own. ``double`` keeps the books in float64, else in float32."""
+    """Regularisation A + ε X of ray Jacobians A, where X depends on ``place``.
+
+    For ``everywhere``, X is the identity at all vertices, as published. For ``smooth``, X is the identity where a
+    smooth lobe was sampled. ``directions`` is the driver's own regularisation. Adjoints are recovered in float64 if
+    ``double``, otherwise in float32.
+    """
 
     place: str = "directions"
     double: bool = True

@@ -1,4 +1,4 @@
-"""The error of a replay's gradient, by kind of bookkeeping and noise in its Jacobians: what `noise` measures."""
+"""The error of a replayed gradient by regularisation, precision and Jacobian noise, for the task `noise`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RECOVERIES = {f"{kind}, {noise:g}": (noise, *how) for kind, how in KINDS.items()
 
 
 class ReplayError(SceneMeasure):
-    """|g - g_sweep| / |g_sweep| of one seed, for a kind of replay; for the sweep, its own Monte Carlo error."""
+    """The relative error |g - g_sweep| / |g_sweep| of a replay for one seed; for the sweep, its Monte Carlo error."""
 
     def __init__(self, job: Job) -> None:
         super().__init__(job)
@@ -40,7 +40,7 @@ class ReplayError(SceneMeasure):
         self.swept = lru_cache(maxsize=4)(lambda seed: self._gradient(SWEEP, Recovery(), seed)[1])
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds of the gradient pass, and the error."""
+        """Return the seconds of the gradient pass, and the relative error."""
         right = self.swept(seed)
         if method == SWEEP:
             seconds, found = self._gradient(SWEEP, Recovery(), self.job.rounds + seed)
@@ -51,7 +51,7 @@ class ReplayError(SceneMeasure):
         return seconds, np.array([error / np.linalg.norm(right)])
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """The errors of all seeds."""
+        """Return the errors of all seeds, by method."""
         return {name: {"values": np.concatenate(rows).tolist()} for name, rows in kept.items() if rows}
 
     def _gradient(self, driver: str, recovery: Recovery, seed: int) -> tuple[float, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What grows with a job: the memory of whole runs of many views and large textures, and sums of very many samples."""
+"""Measures what grows with the size of a job: memory of runs with many views or texels, and error of long sums."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SCENE = """<scene version="3.0.0">{views}<emitter type="constant"/><shape type=
 
 
 def name_of(views: int, texels: int, memory: str = "") -> str:
-    """The name of a job of so many views and texels along each side of a grey texture, with that budget."""
+    """Return the name of a job: number of views, texels along each side of a grey texture, and memory limit."""
     return f"{views} view{'s' if views > 1 else ''}, {texels} x {texels} texels" + (f", memory {memory}" * bool(memory))
 
 
@@ -46,26 +46,26 @@ def _peak_since() -> float:
 
 
 class Watching(threading.Thread):
-    """Looks, some hundred times a second, at what a process takes besides pages of files, until it is told the end."""
+    """Samples the memory of this process without file pages, some hundred times a second, until `ended` is called."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
         self.most, self._end = 0, threading.Event()
 
     def run(self) -> None:
-        """See the class."""
+        """Sample memory until the end."""
         while not self._end.wait(0.005):
             self.most = max(self.most, memory.taken())
 
     def ended(self) -> float:
-        """The most that was seen (MiB)."""
+        """Stop sampling, and return the largest sample (MiB)."""
         self._end.set()
         self.join()
         return self.most / 2**20
 
 
 class WholeRun(Measure):
-    """`pathreplay optimize` from beginning to end, previews, checkpoint and report included."""
+    """A complete run of `pathreplay optimize`, including previews, checkpoint and report."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -75,7 +75,7 @@ class WholeRun(Measure):
         self.peaks: list[float] = []
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds, and the last loss."""
+        """Return seconds and the last loss."""
         begun, watching = time.perf_counter(), Watching()
         watching.start()
         with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR") or "/var/tmp") as folder:
@@ -87,9 +87,9 @@ class WholeRun(Measure):
             return time.perf_counter() - begun, np.array([loss])
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """The peaks (MiB) until the first step was done, of each later one, and while the end was written.
+        """Return peaks of memory (MiB): until the end of the first step, in each later step, and at the end of the run.
 
-        And behind them that of all without pages of files.
+        The last entry is the peak of the whole run without file pages.
         """
         return {name: {"values": tuple(self.peaks)} for name in kept}
 
@@ -114,8 +114,8 @@ class WholeRun(Measure):
 
 
 class Sum(Pass):
-    """Gradient passes under an even sky: how far the sum over all samples is off."""
+    """Gradient passes under a constant sky, which show the error of the sum over all samples."""
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """The largest error of a channel, relative to what is right: a third of the image's mean by each."""
+        """Return the largest relative error of a channel. The exact gradient of the mean image is 1/3 per channel."""
         return {name: {"mean": float(np.abs(np.stack(rows) * 3 - 1).max())} for name, rows in kept.items() if rows}

@@ -1,4 +1,4 @@
-"""A scene that is ready for gradients, the integrators that are compared on it, and a stopwatch."""
+"""A scene whose parameters have gradients, the integrators compared on this scene, and a stopwatch."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .methods import METHODS
 
 
 class SceneMeasure:
-    """What most measures begin with: the scene of a job, with gradients of its parameters; see `job.Measure`."""
+    """Base of most measures (see `job.Measure`): the scene of a job, with gradients enabled for its parameters."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -30,7 +30,7 @@ class SceneMeasure:
         self.integrators: dict[str, Any] = {}
 
     def put(self, keys: Sequence[str]) -> None:
-        """Give the parameters leaves of their own, with gradients."""
+        """Set the parameters to new leaf variables with gradients."""
         for key in keys:
             value = dr.detach(self.params[key])
             self.leaves[key] = type(value)(value)
@@ -39,19 +39,19 @@ class SceneMeasure:
         self.params.update()
 
     def renew(self) -> None:
-        """Leave no gradients of earlier passes behind."""
+        """Clear the gradients of earlier passes."""
         self.put(self.derived)
         for leaf in self.leaves.values():
             dr.clear_grad(leaf)
 
     def integrator(self, name: str) -> Any:
-        """The integrator of that name, made when it is first asked for; what it raises is raised each time."""
+        """Return the integrator of this name, created at its first use. An error is raised again at every use."""
         if name not in self.integrators:
             self.integrators[name] = mi.load_dict(METHODS[name] | self.job.limits)
         return self.integrators[name]
 
     def forget(self) -> None:
-        """Make all integrators anew: what they have learned is gone."""
+        """Discard all integrators, and with them everything that they have learned."""
         self.integrators.clear()
 
 
@@ -61,7 +61,7 @@ def _ad(value: Any) -> int | None:
 
 
 def stopwatch(run: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> tuple[float, Any]:
-    """Seconds until what ``run`` returns is evaluated, by that clock, and what it is."""
+    """Call ``run`` and evaluate its result; return the seconds by ``clock``, and the result."""
     gc.collect()  # not in the middle of the measurement
     dr.sync_thread()
     start = clock()

@@ -1,4 +1,4 @@
-"""What the gradients of many seeds say: their noise entry by entry and along smooth directions, and their bias."""
+"""Statistics of gradients over many seeds: noise by entry, noise along smooth directions, and bias."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ DIRECTIONS = 16  # random, but the same for all methods
 def spreads(
     kept: dict[str, list[np.ndarray]], reference: str | None, grid: tuple[int, ...]
 ) -> dict[str, dict[str, Any]]:
-    """`spread` of every method with at least two rows, all of them finite."""
+    """Return `spread` of every method that has at least two rows and only finite values."""
     others = kept.get(reference or "")
     fit = {name: rows for name, rows in kept.items() if len(rows) > 1 and np.isfinite(rows).all()}
     return {name: spread(rows, others, grid) for name, rows in fit.items()}
 
 
 def spread(rows: Sequence[np.ndarray], reference: Sequence[np.ndarray] | None, grid: tuple[int, ...]) -> dict[str, Any]:
-    """Values by the names that `Point` has for them; ``rows`` are flat gradients, one a seed, as are the lists' values.
+    """Return statistics of the gradients ``rows``, one flat gradient per seed, by the names of fields of `Point`.
 
-    ``grid`` is the shape of the gradient, if it is one tensor: with three axes and channels there are smooth errors.
-    ``reference`` has the seeds of ``rows``.
+    ``grid`` is the shape of the gradient if it is one tensor; errors along smooth directions require three axes and
+    channels. The gradients in ``reference`` have the same seeds as ``rows``.
     """
     gradients = np.stack(rows).astype(np.float64)
     found: dict[str, Any] = {"mean": float(gradients.mean()), "squared_errors": squared_errors(gradients).tolist()}
@@ -35,24 +35,29 @@ def spread(rows: Sequence[np.ndarray], reference: Sequence[np.ndarray] | None, g
 
 
 def squared_errors(rows: np.ndarray) -> np.ndarray:
-    """Of each row: mean of (row - mean of rows)² · n / (n - 1). Their mean is the sample variance, mean over entries.
+    """Return for each row the mean over entries of (row - mean of rows)² · n / (n - 1).
 
-    The rows need not be alike in variance: uncorrelated and of one mean is enough, so that a method that learns from
-    its earlier rows is charged with the mean of what it had then and has now.
+    The mean of the results is the sample variance, averaged over entries. The rows must be uncorrelated and have the
+    same mean, but may have different variances. For a method that learns from earlier rows, the result is therefore its
+    mean variance before and after learning.
     """
     return np.mean((rows - rows.mean(axis=0)) ** 2, axis=1) * len(rows) / (len(rows) - 1)
 
 
 def bias_products(differences: np.ndarray) -> np.ndarray:
-    """Of each row: mean over entries of (row · mean of the other rows). Their mean estimates |bias|² / entries."""
+    """Return for each row the mean over entries of (row · mean of the other rows).
+
+    The mean of the results estimates |bias|² / entries.
+    """
     others = (differences.sum(axis=0) - differences) / (len(differences) - 1)
     return np.mean(differences * others, axis=1)
 
 
 def smooth_directions(grid: tuple[int, ...]) -> np.ndarray:
-    """Unit vectors (DIRECTIONS, entries): half a wave to two waves across the grid, of random direction and phase.
+    """Return unit vectors (DIRECTIONS, entries): waves of random direction and phase, 1/2 to 2 periods across the grid.
 
-    The mean variance along *all* directions is the mean over entries; along these, errors of neighbours add up.
+    The mean variance along *all* directions equals the mean over entries. Along smooth directions, errors of
+    neighbouring entries add up.
     """
     random = np.random.default_rng(5)
     axes = np.meshgrid(*(np.linspace(0, 1, n) for n in grid[:3]), indexing="ij")

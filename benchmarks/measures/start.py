@@ -1,4 +1,4 @@
-"""Processes of their own, timed from import to second gradient, with a kernel cache or without: for `startup`."""
+"""Times new processes from import to second gradient, with or without a kernel cache, for the task `startup`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .methods import STAGES, STOCK, parts
 
 
 class Start(Measure):
-    """Each method and seed has one process, which is started by the call that asks for its first stage."""
+    """Each method and seed has its own process, which the first call for this method and seed starts."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -28,7 +28,7 @@ class Start(Measure):
         self.stages: dict[tuple[str, int], list[float]] = {}
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds of one stage."""
+        """Return the seconds of one stage, which is a part of ``method``."""
         name, stage = parts(method)
         if (name, seed) not in self.stages:
             if self.job.measure == "warm start":
@@ -40,7 +40,7 @@ class Start(Measure):
         return seconds, np.array([seconds])
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """Nothing follows but the seconds themselves."""
+        """Remove the kernel caches; return nothing, because the seconds are the only result."""
         self.kept.cleanup()
         return {}
 

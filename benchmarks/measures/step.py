@@ -1,4 +1,4 @@
-"""Whole optimisation steps, timed: render, loss, gradient, Adam, bounds, new scene. What `iteration` measures."""
+"""Times optimisation steps for the task `iteration`: rendering, loss, gradient, Adam, bounds and scene update."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ TARGET_SPP = 256
 
 
 class Watched(DrJitOptimiser):
-    """Adam that remembers the gradients of its last step."""
+    """Adam optimiser that stores the gradients of its last step."""
 
     seen: Mapping[str, np.ndarray]
 
     def step(self, values: Any, gradients: Any, rates: Any, loss: float = 0.0) -> dict[str, np.ndarray]:
-        """Take the step of Adam."""
+        """Store the gradients, and take a step of Adam."""
         self.seen = gradients
         return super().step(values, gradients, rates)
 
 
 class Step:
-    """A scene, its target, and for every method an optimiser; each call times one step from the start values."""
+    """A scene, its target image, and an optimiser for each method. Each call times one step from the initial values."""
 
     def __init__(self, job: Job) -> None:
         self.job, (self.key,) = job, job.parameters
@@ -79,12 +79,12 @@ class Step:
         self.usual: dict[str, tuple[mi.Integrator, drjit.opt.Adam]] = {}
 
     def forget(self) -> None:
-        """Make integrators and optimisers anew."""
+        """Discard all integrators and optimisers."""
         self.runs.clear()
         self.usual.clear()
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds of a step, and the gradient that it took."""
+        """Return the seconds and the gradient of a step."""
         name, loop = parts(method)
         if method not in self.runs and method not in self.usual:
             integrator = mi.load_dict(METHODS[name] | self.job.limits)
@@ -119,5 +119,5 @@ class Step:
         return seconds, np.ravel(np.array(gradient))
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """What the gradients of all steps say: see `spread`."""
+        """Return statistics of the gradients of all steps: see `spread`."""
         return spreads(kept, None, ())

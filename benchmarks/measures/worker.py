@@ -1,7 +1,7 @@
-"""Runs one job in this process and writes what happens to stdout, one JSON object a line.
+"""Runs one job in this process and writes events to stdout, one JSON object per line.
 
-Started by `runner.py` as `python -m benchmarks.measures.worker JOB`. A method that raises is reported and left out of
-the following rounds; one that kills the process is known by the line that said it was about to run.
+`runner.py` runs `python -m benchmarks.measures.worker JOB`. A method that raises an error is reported and left out of
+the following rounds. A method that kills the process can be identified by its last event, `start`.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ _PIPE: TextIO = sys.stdout
 
 
 def _take_stdout() -> TextIO:
-    """The pipe to the commanding process; from now on whatever else is written to stdout goes to stderr.
+    """Return the pipe to the parent process, and redirect all other output to stdout into stderr.
 
-    Mitsuba's log is: in the middle of a line, when its threads are at it.
+    Otherwise Mitsuba's threads would write log messages into the middle of a line.
     """
     pipe = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
@@ -64,7 +64,7 @@ def _say(event: str, **facts: Any) -> None:
 
 
 def processor_name() -> str:
-    """The processor's own name where the system tells it."""
+    """Return the name of the processor, if the system provides it, otherwise the machine type."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -90,7 +90,7 @@ def _machine(variant: str) -> Machine:
 
 
 def peak_mib() -> float:
-    """Largest resident size that this process has had, MiB."""
+    """Return the largest resident size of this process so far, in MiB."""
     status = Path("/proc/self/status")
     if status.exists():  # what the system calls ru_maxrss counts the size of the process that started this one, too
         return int(status.read_text().split("VmHWM:")[1].split()[0]) / 1024
@@ -99,7 +99,7 @@ def peak_mib() -> float:
 
 
 def told(error: BaseException) -> str:
-    """What an exception says, short enough for a table."""
+    """Return the message of an exception, short enough for a table."""
     from pathreplay.scenes.descriptions import one_line
 
     text = one_line(error)
@@ -109,20 +109,20 @@ def told(error: BaseException) -> str:
 
 
 def limit_memory() -> None:
-    """Let allocations beyond the limit fail."""
+    """Make allocations beyond `MEMORY_LIMIT_GIB` fail."""
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     wanted = MEMORY_LIMIT_GIB * 1024**3
     resource.setrlimit(resource.RLIMIT_DATA, (wanted if hard < 0 else min(wanted, hard), hard))
 
 
 def _measure(job: Job) -> Measure:
-    """Its module, which loads mitsuba, is imported here, once there is a variant."""
+    """Create the measure of a job. Its module is imported here because it needs the variant to be set."""
     module, name = MEASURES[job.measure]
     return getattr(importlib.import_module(f".{module}", __package__), name)(job)
 
 
 def run(job: Job) -> None:
-    """Run a job; events are `machine`, `start`, `sample`, `error`, `facts` (fields of `Point`), `peak`."""
+    """Run a job and report the events `machine`, `start`, `sample`, `error`, `facts` (fields of `Point`) and `peak`."""
     limit_memory()
     variant = backend.set_variant(None)
     baselines.register()

@@ -1,4 +1,4 @@
-"""The scenes that are measured: all made here or by Mitsuba, nothing is read from a file."""
+"""The measured scenes. All are generated here or by Mitsuba; none is read from a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rooms of one wall, one lamp and one mesh that moves: its shadow, its outline, both. The mesh is called ``object``."""
+"""Scenes with a wall, an emitter and a moving mesh ``object``, which show its shadow, its outline or both."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LUMPS = 600
 
 
 def _room(resolution: int, fov: float, glows: bool = False, **parts: mi.Mesh) -> SceneDict:
-    """A wall with a picture, lit by a lamp, or a picture that glows."""
+    """A textured wall lit by an area light, or, with ``glows``, a wall with textured emission."""
     T = mi.ScalarTransform4f
     texels = np.random.default_rng(3).uniform(0.1, 1, (8, 8, 3)).astype(np.float32)
     picture = {"type": "bitmap", "raw": True, "data": mi.TensorXf(texels)}
@@ -51,12 +51,15 @@ def _cube() -> tuple[np.ndarray, np.ndarray]:
 
 
 Bump = tuple[tuple[float, float, float], float, float]
-"""Where it is, how high, and how wide, squared."""
+"""Direction of a bump, its height, and the square of its width."""
 EARS: tuple[Bump, ...] = tuple(((side, 0.8, 0.2), 0.9, 0.06) for side in (-0.5, 0.5))
 
 
 def ball_with_bumps(n: int, *bumps: Bump) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a spiral on the sphere, their hull, and then waves and bumps: closed, and it hides itself."""
+    """Return vertices and faces of a closed, self-occluding mesh: a sphere of n points with waves and bumps.
+
+    The points lie on a spiral, and the faces are those of their convex hull.
+    """
     z = 1 - (2 * np.arange(n) + 1) / n
     turn = np.pi * (1 + np.sqrt(5)) * np.arange(n)
     points = np.stack([*(np.sqrt(1 - z * z) * f(turn) for f in (np.cos, np.sin)), z], -1)
@@ -94,4 +97,4 @@ EDGE_SCENES: dict[str, Callable[[int], SceneDict]] = {
     "black silhouette": lambda n: _room(n, 45, glows=True, object=_box(_paint(0, 0, 0))),
     "black bumps": lambda n: _room(n, 45, glows=True, object=_ears(_paint(0, 0, 0))),
 }
-"""Key of what moves: ``object.vertex_positions``."""
+"""Scenes by name. The key of the moving parameter is ``object.vertex_positions``."""

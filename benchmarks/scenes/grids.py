@@ -1,4 +1,4 @@
-"""Single grids of densities, for flights and shadow rays: 64³ voxels in the unit cube with a highest value of 1."""
+"""Density grids for flights and shadow rays: 64³ voxels in the unit cube, with a maximum of 1."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ GRIDS = ("sparse", "cloud", "wall", "noise", "uniform")
 
 
 def grid_medium(name: str, supergrid: str | bool) -> Any:
-    """The `gridmedium` that is called 'GRID x SCALE'."""
+    """Return the `gridmedium` with the name 'GRID x SCALE'."""
     grid, scale = name.split(" x ")
     data = mi.TensorXf(grid_values(grid).astype(np.float32)[..., None])
     density = {"type": "gridvolume", "data": data}
@@ -20,7 +20,7 @@ def grid_medium(name: str, supergrid: str | bool) -> Any:
 
 
 def grid_values(grid: str) -> np.ndarray:
-    """Six small blobs, a textured cloud, a dense half with a sharp edge, voxels of 0 or 1 by chance, or a constant."""
+    """Return densities: six small blobs, a textured cloud, a sharply bounded half, random 0 or 1, or a constant."""
     z, y, x = (np.mgrid[0:VOXELS, 0:VOXELS, 0:VOXELS] + 0.5) / VOXELS
     random = np.random.default_rng(0)
     match grid:

@@ -1,4 +1,4 @@
-"""The scenes with media that are measured: clouds, a sealed room of fog, and sparse grids, all made here."""
+"""The measured scenes with media: clouds, a sealed room of fog, and sparse grids."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def _noise(size: int, waves: int, seed: int) -> np.ndarray:
 
 
 def cloud_density(size: int, floor: float, width: float = 0.5) -> np.ndarray:
-    """A ragged ball of density 1 at its peak and never less than ``floor``."""
+    """Return the densities of a ragged ball, with maximum 1 and a lower bound of ``floor``."""
     z, y, x = _axes(size)
     ball = np.exp(-(x * x + y * y + z * z) / width**2 + 0.6 * _noise(size, 24, seed=0))
     return floor + (1 - floor) * ball / ball.max()
 
 
 def blobs(size: int) -> np.ndarray:
-    """Six small dense blobs in emptiness: mean density 1 to 2 % of the peak, nine tenths of the voxels empty."""
+    """Return six small dense blobs with a mean density of 1 to 2 % of the maximum and nine tenths empty voxels."""
     z, y, x = _axes(size)
     total = np.zeros_like(x)
     for cx, cy, cz in np.random.default_rng(1).uniform(-0.8, 0.8, (6, 3)):
@@ -144,9 +144,9 @@ def room_with_cloud(resolution: int) -> SceneDict:
 
 
 def sealed_fog(resolution: int) -> SceneDict:
-    """A sealed white room, filled with fog but for a gap before the sensor: no path ends before ``max_depth``.
+    """A sealed white room filled with fog, except for a gap in front of the sensor. No path ends before ``max_depth``.
 
-    Nothing is absorbed in the fog and 0.001 at the walls. The fog's grid is uneven, so that null events are drawn too.
+    The fog absorbs nothing, and the walls absorb 0.001. The density is not constant, so that null collisions occur.
     """
     T = mi.ScalarTransform4f
     fog = _medium(0.7 + 0.3 * np.tanh(_noise(16, 24, seed=3)), depth=20, albedo=1.0, g=0)

@@ -1,6 +1,6 @@
-"""Scenes as people have them in which one number moves something: a head, its shadow, cameras, glass, corners.
+"""Realistic scenes in which one number moves something: a head, its shadow, a camera, or objects behind glass.
 
-The head is closed, shaded smoothly, and hides itself: a bumpy ball with two ears, brows and a snout, made by script.
+The head is a closed, smooth-shaded mesh that occludes itself: a bumpy ball with ears, eyes and a snout.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from .edges import ball_with_bumps, mesh_of
 from .parts import SceneDict, sensor
 
 HEAD, FIELD = 2000, 24
-"""Vertices of the head, and of a side of the field of heights."""
+"""Number of vertices of the head's ball, and along each side of the height field."""
 Move = Callable[..., Any]
-"""(value, number) -> the value that is moved by it."""
+"""(value, number) -> the value, moved by the number."""
 
 
 @dataclass(frozen=True)
 class Mover:
-    """A scene by resolution, and how the parameter that task `edges` names for it moves with a number."""
+    """A function from the resolution to a scene, and the motion of the scene's parameter in task `edges`."""
 
     scene: Callable[[int], SceneDict]
     move: Move
@@ -32,7 +32,7 @@ class Mover:
 
 
 def T() -> Any:
-    """The identity, of the variant that is set when a scene is made."""
+    """Return the identity transform of the active variant."""
     return mi.ScalarTransform4f()
 
 
@@ -212,5 +212,5 @@ MOVERS: dict[str, Mover] = {
         _slide(1, 0.3, 0),
     ),
 }
-"""What moves is ``object``, or the camera."""
+"""Scenes by name. Either ``object`` or the camera moves."""
 MOVING_SCENES = {name: mover.scene for name, mover in MOVERS.items()}

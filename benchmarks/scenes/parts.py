@@ -1,4 +1,4 @@
-"""What the scenes have in common."""
+"""Common parts of the scenes."""
 
 from __future__ import annotations
 

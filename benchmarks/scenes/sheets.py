@@ -1,4 +1,4 @@
-"""Bent sheets face to face and bent panes of glass, under a smooth sky: chains of smooth bounces."""
+"""Bent sheets that face each other, and bent panes of glass, under a smooth sky. Paths have many smooth bounces."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def smooth_environment(height: int = 32) -> SceneDict:
 
 
 def corridor(bsdf: SceneDict, resolution: int) -> SceneDict:
-    """Two sheets, seen from the side: nearly every path bounces to and fro between them."""
+    """Two sheets seen from the side. Nearly every path bounces back and forth between the sheets."""
     return {
         "type": "scene",
         "environment": smooth_environment(),
@@ -51,7 +51,7 @@ def corridor(bsdf: SceneDict, resolution: int) -> SceneDict:
 
 
 def panes(interfaces: int, wall: SceneDict | None, resolution: int) -> SceneDict:
-    """Bent panes of glass, one behind the other, in front of a wall if there is one: chains of delta lobes."""
+    """Bent panes of glass one behind the other, optionally in front of a wall. Paths are chains of delta lobes."""
     glass = {"type": "dielectric_ad", "int_ior": 1.5}
     scene = {
         "type": "scene",

@@ -1,4 +1,4 @@
-"""The scenes of surfaces that are measured: Cornell boxes, a sealed box, and metal balls under an environment."""
+"""The measured scenes without media: Cornell boxes, a sealed box, and metal balls under an environment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _texture(size: int, low: float, high: float) -> SceneDict:
 
 
 def cornell_box(resolution: int) -> SceneDict:
-    """Mitsuba's Cornell box with a texture on its back wall: key ``back.bsdf.reflectance.data``."""
+    """Mitsuba's Cornell box with a texture on its back wall. Key: ``back.bsdf.reflectance.data``."""
     scene: SceneDict = mi.cornell_box()
     scene["sensor"]["film"] |= {"width": resolution, "height": resolution}
     scene["back"]["bsdf"] = {"type": "diffuse", "reflectance": _texture(64, 0.1, 0.9)}
@@ -25,7 +25,10 @@ def cornell_box(resolution: int) -> SceneDict:
 
 
 def glass_and_diffuse(resolution: int) -> SceneDict:
-    """The same box with a glass ball for the large box: keys as above, and ``ball.to_world``."""
+    """Mitsuba's Cornell box with a textured back wall and a glass ball instead of the large box.
+
+    Keys: ``back.bsdf.reflectance.data``, ``ball.to_world``.
+    """
     scene = cornell_box(resolution)
     del scene["large-box"]
     place = mi.ScalarTransform4f().translate([-0.35, -0.55, -0.2]).scale(0.4)
@@ -34,7 +37,7 @@ def glass_and_diffuse(resolution: int) -> SceneDict:
 
 
 def glossy_environment(resolution: int) -> SceneDict:
-    """Rough metal balls on a glossy textured floor under an environment: key ``floor.bsdf.base_color.data``."""
+    """Rough metal balls on a glossy textured floor under an environment. Key: ``floor.bsdf.base_color.data``."""
     T = mi.ScalarTransform4f
     floor = {"type": "principled", "base_color": _texture(64, 0.1, 0.9), "roughness": 0.3, "specular": 0.6}
     scene: SceneDict = {
@@ -63,9 +66,9 @@ def _sky() -> np.ndarray:
 
 
 def closed_box(resolution: int) -> SceneDict:
-    """A sealed white box seen from within, with a small light and a glass ball: no path leaves, few are absorbed.
+    """A sealed white box seen from inside, with a small light and a glass ball. No path leaves, and few are absorbed.
 
-    The walls reflect 0.999, so that with Russian roulette off a path is as long as ``max_depth`` allows. Keys:
+    The walls reflect 0.999. Without Russian roulette, a path is therefore as long as ``max_depth`` allows. Keys:
     ``box.bsdf.reflectance.data``, ``ball.to_world``.
     """
     T = mi.ScalarTransform4f

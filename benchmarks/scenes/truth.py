@@ -1,4 +1,4 @@
-"""Small scenes for the cells of `truth`: one object in a room or under a sky, and boxes of fog."""
+"""Small scenes for the task `truth`: an object in a room or under a sky, and boxes of fog."""
 
 from __future__ import annotations
 
@@ -179,4 +179,4 @@ TRUTH_SCENES: dict[str, Callable[[], SceneDict]] = {
     "camera in a cloud": _camera_in_a_cloud,
     "fog in glass": _fog_in_glass,
 }
-"""Scene by name, as a dictionary for mi.load_dict (with optimize=False, to keep the keys)."""
+"""Scenes by name, as dictionaries for mi.load_dict (with optimize=False, which keeps the keys)."""

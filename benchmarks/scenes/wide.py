@@ -1,4 +1,4 @@
-"""Scenes of many shapes with a BSDF each, and one with nothing in it: for what grows with a scene, and with samples."""
+"""Scenes of many shapes with a BSDF each, and a scene with only a sky, for the task `scale`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COLOUR, SKY = "shape0.bsdf.reflectance.value", "sky.radiance.value"
 
 
 def shapes_name(count: int) -> str:
-    """The name of the scene of so many shapes."""
+    """Return the name of the scene with this number of shapes."""
     return f"{count} shape{'s' if count > 1 else ''}"
 
 
@@ -39,7 +39,7 @@ def _wall(count: int, resolution: int) -> SceneDict:
 
 
 def even_sky(resolution: int) -> SceneDict:
-    """The same radiance everywhere, so that sums of samples are known: key ``sky.radiance.value``."""
+    """A sky of constant radiance, for which sums of samples are known. Key: ``sky.radiance.value``."""
     return {
         "type": "scene",
         "sensor": sensor(resolution, [0, 0.01, 3], [0, 0, 0], fov=40),

@@ -1,1 +1,1 @@
-"""What is measured: each task lists its jobs and makes a table of what they found."""
+"""The benchmark tasks. Each task lists its jobs, and formats their results as a table."""

@@ -1,4 +1,4 @@
-"""Task `attached`: gradients of things that move, in turn with `prb`, and memory against depth and paths."""
+"""Task `attached`: time of gradients of moving objects relative to `prb`, and memory against depth and paths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BOX = "small-box.vertex_positions"
 
 
 def jobs(quick: bool) -> list[Job]:
-    """What moves x depth, in turn; then memory in a process of its own, against depth and against paths."""
+    """List the timings for each moving object and depth, then the memory measurements, each in its own process."""
     timed = [
         Job(
             scene=SCENE,
@@ -51,7 +51,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Time next to `prb`, which leaves out most of this gradient; then peak memory."""
+    """Format times relative to `prb`, which leaves out most of these gradients, then peak memory."""
     timed = [point for point in record.points if point.scene == SCENE]
     rows = [
         [", ".join(p.parameters), str(p.max_depth), method_cell(p), *time_cells(p, methods.get("prb"))]

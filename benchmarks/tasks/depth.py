@@ -1,4 +1,4 @@
-"""Task `depth`: time and peak memory of a gradient pass against the length of the paths."""
+"""Task `depth`: time and peak memory of a gradient pass as functions of path length."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ PATIENCE_S = 10
 
 
 def jobs(quick: bool) -> list[Job]:
-    """A process of its own for each method and depth, all with one thread: time is then proportional to work.
+    """List one job for each method and depth. Each process has one thread, so that time is proportional to work.
 
-    Russian roulette starts beyond the last vertex, so that every path in the closed box has ``max_depth`` of them.
+    Russian roulette starts beyond the last vertex, so that every path in the closed box has ``max_depth`` vertices.
     """
     rows = {SURFACES: (WALLS, QUICK)} if quick else ROWS
     return [
@@ -75,7 +75,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def _ladder(deepest: int, factor: int) -> list[int]:
-    """SHALLOWEST, and so on by the factor."""
+    """Return SHALLOWEST and its multiples by powers of ``factor``, up to ``deepest``."""
     depths = [SHALLOWEST]
     while depths[-1] * factor <= deepest:
         depths.append(depths[-1] * factor)
@@ -83,18 +83,18 @@ def _ladder(deepest: int, factor: int) -> list[int]:
 
 
 def table(record: Record) -> str:
-    """Time, then memory, of surfaces and of media."""
+    """Format tables of time and memory, for surfaces and for media."""
     scenes = dict.fromkeys(point.scene for point in record.points)
     return "\n\n".join(part for scene in scenes for part in _tables(of_scene(record, scene)))
 
 
 def of_scene(record: Record, scene: str) -> Record:
-    """The record with the points of one scene only."""
+    """Return the record with only the points of one scene."""
     return replace(record, points=tuple(point for point in record.points if point.scene == scene))
 
 
 def _tables(record: Record) -> list[str]:
-    """Seconds (of the fastest round), the exponent of time; then MiB, and their growth; by depth and method."""
+    """Format two tables by depth and method: seconds with their exponent, and MiB with their growth."""
     methods = list(dict.fromkeys(point.method for point in record.points))
     depths = sorted({point.max_depth for point in record.points})
     cells = {(point.max_depth, point.method): point for point in record.points}
@@ -112,29 +112,29 @@ def _tables(record: Record) -> list[str]:
 
 
 def fastest(point: Point) -> float:
-    """Seconds of the fastest round: the work is the same in all, and what else the machine does can only add."""
+    """Return the seconds of the fastest round. All rounds do the same work; other load only adds time."""
     return min(point.seconds)
 
 
 def seconds_cell(point: Point | None) -> str:
-    """Seconds of the fastest round, or why there are none."""
+    """Return the seconds of the fastest round, or the error message."""
     if point is None:
         return ""
     return point.error or f"{fastest(point):.4f}"
 
 
 def memory_cell(point: Point | None) -> str:
-    """Peak MiB of the process."""
+    """Return the peak memory of the process in MiB."""
     return "" if point is None or point.peak_mib is None else f"{point.peak_mib:.0f}"
 
 
 def alive(record: Record, method: str) -> list[Point]:
-    """Points of the method, by increasing depth, that came to an end."""
+    """Return the points of a method without error, by increasing depth."""
     return [point for point in record.points if point.method == method and not point.error]
 
 
 def exponent(record: Record, method: str) -> str:
-    """Exponent of time, with its interval."""
+    """Return the exponent of time with its interval."""
     points = alive(record, method)
     if len(points) < 5:
         return "too few depths"
@@ -142,6 +142,6 @@ def exponent(record: Record, method: str) -> str:
 
 
 def memory_growth(record: Record, method: str) -> str:
-    """Peak memory at the largest depth over that at the smallest."""
+    """Return the ratio of peak memory at the largest and at the smallest depth."""
     peaks = [point.peak_mib for point in alive(record, method) if point.peak_mib is not None]
     return f"{peaks[-1] / peaks[0]:.2f}" if peaks else ""

@@ -1,11 +1,11 @@
-"""Task `edges`: what edges cost, by kind, beside `prb` and beside Mitsuba's projective sampling.
+"""Task `edges`: cost of boundary terms, by kind, relative to `prb` and to Mitsuba's projective sampling.
 
-Seconds are those of kernels. The parts of ours, and those of `prb_projective`, are gradients of one thing: of what the
-camera sees, or of what surfaces see. Lists of edges are right where a mesh that is black moves before a glow: elsewhere
-they leave creases out, and shade the wrong faces (see docs/edges_peers.md).
+Times are seconds of kernels. A part of our boundary term is compared with the part of `prb_projective` for the same
+edges: edges that the camera sees, or edges that surfaces see. Edge lists are correct if a black mesh moves in front of
+an emissive wall. In other scenes they omit creases and shade the wrong faces (see docs/edges_peers.md).
 
-And what a derivative by one number is worth, interior and edges, beside a central difference with common random
-numbers, which is what one would do without gradients.
+The task also compares derivatives with respect to one number, interior and boundary terms together, with central
+differences with common random numbers, the method for which no gradients are needed.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ VERSUS = (
     ("secondary boundary", "unguided secondary"),
     ("projective secondary", "secondary boundary"),
 )
-"""What is compared with what that finds the same; the last the other way round, since it is many times as much."""
+"""Pairs of methods that estimate the same part, as (method, baseline). The last pair is reversed, because its ratio is
+large."""
 ROUNDS, CHEAP_ROUNDS = 60, 480
-"""The first say a ratio of variances within a third; where all takes little time there are more."""
+"""ROUNDS determine a ratio of variances to within a third; jobs in which all methods are fast use CHEAP_ROUNDS."""
 STEPS = tuple(f"{name}, {way}" for name in ("prb", "all boundaries") for way in (TRACED, RECORDED))
 GUIDED = 120
-"""Seconds after which `prb_projective` sits out, whose guiding takes most of them."""
+"""Seconds after which `prb_projective` skips the remaining rounds. Guiding takes most of these seconds."""
 TINY, SMALL, LARGE = 16, 32, 128
-"""Pixels along a side. On few the several kernels of edges do not fill the cores, as the one of `prb` does."""
+"""Pixels along a side. With few pixels, kernels of boundary terms do not fill the cores; the kernel of `prb` does."""
 
 OURS = "boundary and interior"
 PLACE, LOOK_FROM = "object.to_world", "camera.to_world"
@@ -51,11 +52,11 @@ MOVING = {
     "ball lifts off": (PLACE, 3),
     "small in a room": (PLACE, 3),
 }
-"""Scenes of which one number is asked: what it moves, and the depth."""
+"""Scenes for derivatives with respect to one number: the key of the moving parameter, and the depth."""
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Inner edges, edges on the film, recorded steps; guided baselines and large films have jobs of their own."""
+    """List the jobs: single numbers, secondary and primary edges, guided baselines, large films and recorded steps."""
     inner = ("prb", "secondary boundary", "primary boundary", "boundary alone", "unguided secondary")
     film = ("prb", "primary boundary", "edge list")
     wanted = [(scene, inner, 0.0, SMALL) for scene in INNER] + [(scene, film, 0.0, SMALL) for scene in FILM]
@@ -82,7 +83,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def by_number(scene: str, key: str, depth: int, quick: bool) -> Job:
-    """A derivative by one number, and a central difference by the same."""
+    """Create the job that compares a derivative with respect to one number with a central difference."""
     return Job(
         scene=scene,
         parameters=(key,),
@@ -98,9 +99,10 @@ def by_number(scene: str, key: str, depth: int, quick: bool) -> Job:
 
 
 def table(record: Record) -> str:
-    """What edges cost, scene by scene; then all methods next to `prb`, and recorded steps next to their kernels.
+    """Format four tables.
 
-    Last, derivatives by one number next to central differences.
+    The tables contain the cost of boundary terms by scene, all methods relative to `prb`, recorded steps relative to
+    their kernels, and derivatives with respect to one number relative to central differences.
     """
     found = by_job([point for point in timed(record) if ", " not in point.method])
     rows = [[p.scene, method_cell(p), *_times(p, job.get("prb"))] for job in found for p in job.values()]
@@ -110,12 +112,12 @@ def table(record: Record) -> str:
 
 
 def timed(record: Record) -> list[Point]:
-    """What was measured for its time."""
+    """Return the points with timings of boundary terms."""
     return [point for point in record.points if point.measure == "edges"]
 
 
 def worth(record: Record) -> str:
-    """Variance of a derivative by one number over that of a central difference, and how much of it one pass has."""
+    """Format variances relative to central differences, and the fraction of the variance due to the worst pass."""
     found: dict[str, dict[str, Point]] = {}
     for point in record.points:
         if point.measure == "number":
@@ -138,7 +140,7 @@ def worth(record: Record) -> str:
 
 
 def by_job(points: list[Point]) -> list[dict[str, Point]]:
-    """By method, what was measured in turn: `prb` comes first in each job."""
+    """Group the points by job, each a dictionary by method; `prb` is the first method of each job."""
     found: list[dict[str, Point]] = []
     for point in points:
         if point.method == "prb" or not found:
@@ -148,7 +150,7 @@ def by_job(points: list[Point]) -> list[dict[str, Point]]:
 
 
 def costs(found: list[dict[str, Point]]) -> str:
-    """A row for each scene: times next to `prb`, and time x variance next to baselines."""
+    """Format a row for each scene: times relative to `prb`, and time x variance relative to baselines."""
     timed = ("primary boundary", "secondary boundary", "boundary alone", "projective secondary")
     header = ["scene", *(f"{name} / prb" for name in timed), f"boundary alone / prb, {LARGE} x {LARGE}"]
     header += [f"time x variance of {a} / {b}" for a, b in VERSUS]
@@ -169,7 +171,7 @@ def costs(found: list[dict[str, Point]]) -> str:
 
 
 def _times(point: Point, baseline: Point | None) -> list[str]:
-    """As `time_cells`, of the rounds that both have: one may have sat out the last."""
+    """Return `time_cells` for the rounds of both points; one of the methods may have skipped the last rounds."""
     return time_cells(point, baseline) if baseline is None or baseline is point else time_cells(*_both(point, baseline))
 
 
@@ -183,7 +185,7 @@ def _both(point: Point, baseline: Point) -> tuple[Point, Point]:
 
 
 def _cost(job: dict[str, Point] | None, ours: str, other: dict[str, Point] | None, baseline: str) -> str:
-    """Time x variance next to a baseline. If it ran in another job, times of `prb` in both correct for the load."""
+    """Return time x variance relative to a baseline; times of `prb` correct for the load if the jobs differ."""
     if job is None or other is None or job[ours].error or other[baseline].error:
         return ""
     seconds = [st.median(x["prb"].seconds) if "prb" in x and x["prb"].seconds else 1.0 for x in (job, other)]
@@ -192,7 +194,7 @@ def _cost(job: dict[str, Point] | None, ours: str, other: dict[str, Point] | Non
 
 
 def _steps(steps: dict[str, Point]) -> str:
-    """A step by the clock where it was recorded, and its kernels where it was traced."""
+    """Format wall-clock times of recorded steps, and seconds of kernels of traced steps."""
     rows = []
     for name in ("prb", "all boundaries"):
         found = [steps.get(f"{name}, {way}") for way in (RECORDED, TRACED)]

@@ -15,10 +15,10 @@ COUNTED = "sealed-fog, counted"
 
 
 def jobs(quick: bool) -> list[Job]:
-    """A process of its own for each method and depth, with one thread: time is then proportional to work.
+    """List one job for each method and depth. Each process has one thread, so that time is proportional to work.
 
-    Russian roulette starts beyond the last vertex, so that nearly all paths have ``max_depth`` of them. How many of
-    these are events in the medium is counted by a job of its own at each depth.
+    Russian roulette starts beyond the last vertex, so that nearly all paths have ``max_depth`` vertices. At each depth,
+    a separate job counts the vertices that are events in the medium.
     """
     depths = (4, 64) if quick else (4, 16, 64, 256, 1024, 2048)
 
@@ -43,7 +43,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Seconds (of the fastest round) and MiB by events and method; then the exponent of time and growth of memory."""
+    """Format seconds of the fastest round and MiB by events and method, with the exponent of time and memory growth."""
     events = {point.max_depth: point.mean for point in record.points if point.scene == COUNTED and point.mean}
     methods = list(dict.fromkeys(point.method for point in record.points if point.scene != COUNTED))
     cells = {(point.max_depth, point.method): point for point in record.points}

@@ -1,8 +1,8 @@
-"""Task `gridmedium`: what the cells of that medium save on flights, and noise and time of its transmittance.
+"""Task `gridmedium`: time of flights with and without cells of the medium, and noise and time of its transmittance.
 
-All methods of a job take turns. Times are means, not medians, since the clocks of some systems tick every few
-milliseconds. The cost of an estimate is its mean squared error times CPU time, relative to ratio tracking with one
-majorant.
+All methods of a job run in alternation. Times are means instead of medians, because the clocks of some systems tick
+only every few milliseconds. The cost of an estimate is its mean squared error times CPU time, relative to ratio
+tracking with one majorant.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SCALES: dict[Kind, tuple[tuple[int, ...], tuple[int, ...]]] = {
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Flights, then shadow rays, in each grid at each scale."""
+    """List the jobs: flights, then shadow rays, in each grid at each scale."""
     return [
         Job(
             scene=f"{grid} x {scale}",
@@ -48,7 +48,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Flights: collisions and speed-up. Transmittance: time, squared error, cost, and mean error in standard errors."""
+    """Format collisions and speed-up of flights; time, squared error, cost and z-score of transmittances."""
     flights = groups(point for point in record.points if point.measure == "flight")
     speed = [
         [scene, *(_count(found.get(name)) for name in (ONE, AUTO)), *(_gain(found, n) for n in (AUTO, CELLS))]

@@ -1,4 +1,4 @@
-"""Task `iteration`: one optimisation step from end to end, by the loop that Mitsuba's tutorials show and by ours."""
+"""Task `iteration`: a complete optimisation step, in the loop of Mitsuba's tutorials and in our loop."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROWS = (
 
 
 def jobs(quick: bool) -> list[Job]:
-    """One job for each scene; every step starts from the same values, so that the gradients of a method are alike."""
+    """List one job for each scene. Every step starts from the same values, so that gradients of a method compare."""
     return [
         Job(
             scene=scene,
@@ -44,7 +44,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Each way next to the usual loop with Mitsuba's integrator, with 95 % intervals."""
+    """Format each method relative to the tutorials' loop with Mitsuba's integrator, with 95 % intervals."""
     rows = [
         [point.scene, method_cell(point), *comparison(point, found.get(SURFACE[0]) or found.get(MEDIA[0]))]
         for found in groups(record.points).values()

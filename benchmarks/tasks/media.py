@@ -1,4 +1,4 @@
-"""Task `media`: time x variance of gradients of media, in turn with `prbvolpath`; learning is paid for."""
+"""Task `media`: time x variance of gradients of media relative to `prbvolpath`, including the cost of learning."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ WHAT = {DENSITY: "density", ALBEDO: "albedo", ASYMMETRY: "g", EXTINCTION: "sigma
 
 
 def jobs(quick: bool) -> list[Job]:
-    """One job for each row."""
+    """List one job for each row of the table."""
     return [
         Job(
             scene=scene,
@@ -57,7 +57,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Each method next to `prbvolpath`, with 95 % intervals."""
+    """Format each method relative to `prbvolpath`, with 95 % intervals."""
     header = ["scene", "gradient of", "method", "seconds (median)", "time ratio", "variance ratio"]
     header += ["along waves", "efficiency", "bias² / variance"]
     rows = [

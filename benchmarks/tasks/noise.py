@@ -1,9 +1,10 @@
-"""Task `noise`: error of attached path replay against the sweep, by smooth bounces, noise and kind of bookkeeping.
+"""Task `noise`: error of attached path replay relative to the sweep, by number of bounces, noise and kind of replay.
 
-Two bent sheets face each other under a smooth environment; the gradient is that of an image by the vertices of one
-of them. Both drivers see the same paths, so the error, |g_replay - g_sweep| / |g_sweep|, is made of two things only:
-the noise ε put into the Jacobians (grows with it, has mean zero, averages out) and rounding that their inverses
-magnify (grows as the noise shrinks, does not average out). The sweep inverts nothing; its own rounding is 1e-6.
+Two bent sheets face each other under a smooth environment. The image is differentiated with respect to the vertices of
+one sheet. Both drivers trace the same paths. The error |g_replay - g_sweep| / |g_sweep| therefore has only two causes.
+The first is the noise ε added to the Jacobians. Its contribution grows with ε, has mean zero and averages out. The
+second is rounding, magnified by the inverses of the Jacobians. This contribution grows as ε shrinks, and does not
+average out. The sweep inverts no Jacobians; its rounding error is 1e-6.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ QUICK = (("diffuse sheets", 2, ("everywhere, float32, 0.01", "directions, float6
 
 
 def jobs(quick: bool) -> list[Job]:
-    """One job for each scene and number of bounces."""
+    """List one job for each scene and number of bounces."""
     return [
         Job(
             scene=scene,
@@ -56,7 +57,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Error by scene, bounces and kind of books (down) and noise (across); then the sweep's own, and time."""
+    """Format errors by scene, bounces and kind (rows) and noise (columns), the sweep's Monte Carlo error, and time."""
     levels = [level for level in (*NOISES, 0) if any(p.method.endswith(f", {level:g}") for p in record.points)]
     rows = []
     for (scene, _, depth, _), found in groups(record.points).items():
@@ -80,7 +81,7 @@ def _error(point: Point | None) -> str:
 
 
 def _slowness(points: Iterable[Point | None], sweep: Point | None) -> str:
-    """Of the slowest level."""
+    """Return the time of the slowest noise level relative to the sweep."""
     if sweep is None or sweep.error:
         return ""
     ratios = [Versus(point, sweep).time().value for point in points if point and not point.error]

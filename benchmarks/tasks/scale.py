@@ -1,4 +1,4 @@
-"""Task `scale`: memory against views, parameters and samples, and time against shapes (traced, recorded) and actors."""
+"""Task `scale`: memory by number of views, parameters and samples, and time by number of shapes and of actors."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ BUDGET = "4 GiB"
 SAMPLES = (20, 24, 28, 32, 33)
 ACTORS = (1, 2)
 BYTES = 12
-"""Of a parameter and what Adam remembers of it."""
+"""Bytes of a parameter's value and of its state in Adam."""
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Each whole run in a process of its own; shapes by `prb` and by us in turn."""
+    """List the jobs: whole runs in one process each, sums, shapes with `prb` and `sweep` in alternation, and actors."""
     run = Job(
         scene="",
         parameters=("wall.bsdf.reflectance.data",),
@@ -63,7 +63,10 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def _by_actors(run: Job, quick: bool) -> list[Job]:
-    """As many cores as actors are wanted, and `pip install 'pathreplay[ray]'`: rows say so where it is missing."""
+    """List the jobs with actors. They need one core per actor and `pip install 'pathreplay[ray]'`.
+
+    If Ray is missing, the rows contain an error message.
+    """
     ways = actors.PROCESS, *(actors.many(n) for n in ACTORS[: 1 if quick else None])
     # In turn, since processors that others use as well are slower for minutes.
     job = replace(run, parameters=(), methods=ways, measure="iterations", threads=1, rounds=1 if quick else 3)
@@ -75,7 +78,7 @@ def _by_actors(run: Job, quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Memory of whole runs, of passes of many samples with the error of their sum, and time of shapes and actors."""
+    """Format tables: memory of whole runs, memory and error of sums over many samples, time by shapes and by actors."""
     runs = [p for p in record.points if p.measure == "whole run"]
     sums = [p for p in record.points if p.measure == "sum"]
     shapes = [p for p in record.points if p.measure == "gradient"]

@@ -1,4 +1,4 @@
-"""Task `startup`: seconds until a new process has its first gradient, and its second."""
+"""Task `startup`: seconds until a new process has computed its first and its second gradient."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ METHODS = ("prb", "sweep")
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Kernel cache empty, and filled by an earlier process; each round is a process of its own for each method."""
+    """List the jobs with an empty and a filled kernel cache; each method has its own process in each round."""
     return [
         Job(
             scene="cornell-box",
@@ -33,7 +33,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Seconds by kernel cache and stage, fastest and slowest of the processes in brackets."""
+    """Format seconds by kernel cache and stage, with the fastest and the slowest process in brackets."""
     rows = []
     for measure in dict.fromkeys(point.measure for point in record.points):
         found = next(iter(groups(point for point in record.points if point.measure == measure).values()))

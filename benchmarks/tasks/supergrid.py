@@ -1,4 +1,4 @@
-"""Task `supergrid`: what a coarse grid of local majorants saves on a sparse 64³ grid, and costs on a uniform one."""
+"""Task `supergrid`: time that coarse local majorants save on a sparse 64³ grid, and cost on a uniform grid."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TURNS = 2
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Image and gradient for each grid and choice of majorants; every process comes TURNS times, in turn."""
+    """List image and gradient jobs for each grid and choice of majorants, each repeated TURNS times in alternation."""
     return [
         Job(
             scene=f"{grid}, {choice}",
@@ -43,7 +43,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Speed and noise relative to one majorant for the whole grid."""
+    """Format speed and variance relative to one majorant for the whole grid."""
     found = {(point.scene, point.measure): point for point in pooled(record.points)}
     rows = []
     for (scene, measure), point in found.items():

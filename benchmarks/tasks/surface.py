@@ -1,4 +1,4 @@
-"""Task `surface`: time and variance of gradients by a texture, and by lights alone, in turn with `prb`."""
+"""Task `surface`: time and variance of gradients with respect to a texture or to emitters, relative to `prb`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LIGHTS = ("prb", "auto", "sobol")  # no driver is chosen: where only lights have
 
 
 def jobs(quick: bool) -> list[Job]:
-    """One job for each row; the Cornell box has the size that the claim is made for."""
+    """List one job for each row. The Cornell box has the resolution for which the documentation states results."""
 
     def job(scene: str, parameters: tuple[str, ...], methods: tuple[str, ...] = METHODS) -> Job:
         return Job(
@@ -40,12 +40,12 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def what(parameters: tuple[str, ...]) -> str:
-    """What is differentiated, in a word."""
+    """Return one word for the differentiated parameters."""
     return {SKY: "sky", LAMP: "light"}.get(parameters, "texture")
 
 
 def table(record: Record) -> str:
-    """Each method next to `prb`, with 95 % intervals."""
+    """Format each method relative to `prb`, with 95 % intervals."""
     rows = [
         [point.scene, what(point.parameters), method_cell(point), *comparison(point, methods.get("prb"))]
         for methods in groups(record.points).values()

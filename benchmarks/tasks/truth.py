@@ -1,4 +1,4 @@
-"""Task `truth`: derivatives against finite differences of Mitsuba's path tracers, cell by cell, ours and Mitsuba's."""
+"""Task `truth`: compares our derivatives and Mitsuba's with finite differences of Mitsuba's path tracers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Where = Literal["everywhere", "full", "empty"]
 
 @dataclass(frozen=True)
 class Cell:
-    """One derivative: of a weighted image, with respect to one parameter along one direction."""
+    """One derivative of a weighted image, with respect to one parameter along one direction."""
 
     name: str
     scene: str  # in truth_scenes.py
@@ -40,7 +40,11 @@ DENSITY, ALBEDO = MEDIUM + "sigma_t.data", MEDIUM + "albedo.data"
 
 
 def _medium(name: str, scene: str, key: str, step: float, where: Where = "everywhere", spp: int = 64) -> Cell:
-    """Delta tracking decides anew at every step, so that its noise does not shrink with it: steps are large."""
+    """Create a cell of a scene with media.
+
+    Delta tracking makes new random decisions at every step size h, so that its noise does not decrease with h. Steps
+    are therefore large.
+    """
     return Cell(name, scene, key, "media", 4, step, where, spp, reference_spp=256)
 
 
@@ -77,7 +81,7 @@ QUICK = ("plastic, diffuse part", "constant density", "binary density, empty vox
 
 
 def jobs(quick: bool) -> list[Job]:
-    """One job for each cell: differences of both step sizes, then every method, in turn."""
+    """List one job for each cell: finite differences with both step sizes and all methods, in alternation."""
     return [
         Job(
             scene=cell.name,
@@ -97,9 +101,9 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """One table for surfaces, one for media: derivative, z-score, and verdict where it is not that it passes.
+    """Format a table for surfaces and a table for media: derivative, z-score, and the verdict unless it is a pass.
 
-    What a method says that raises is in the record.
+    Error messages of methods are only in the record.
     """
     parts = []
     for room, methods in (("surfaces", SURFACE), ("media", MEDIA)):
@@ -114,7 +118,7 @@ def table(record: Record) -> str:
 
 
 def told(point: Point | None) -> str:
-    """A derivative, and its verdict where it is not that it passes."""
+    """Format a derivative, and its verdict unless it is a pass."""
     if point is None:
         return ""
     if point.error:

@@ -70,8 +70,8 @@ def judge(
     """
     with np.errstate(invalid="ignore"):  # infinite samples are handled below
         reference = (4 * half_step - full_step) / 3
-        # The error of D(h/2) is a third of the change caused by halving the step. This error is a conservative bound for
-        # the extrapolation, which is more accurate.
+        # The error of D(h/2) is a third of the change caused by halving the step. This error is a conservative bound
+        # for the extrapolation, which is more accurate.
         change, change_se = mean_and_error((half_step - full_step) / 3)
         g, g_se, r, r_se = map(float, (*mean_and_error(gradient), *mean_and_error(reference)))
     truncation = math.sqrt(max(0.0, change**2 - change_se**2))
