@@ -20,8 +20,8 @@ from pathreplay.transport.vertex import Arrival, TraceConfig
 MEETS = 1e-3
 """Largest relative difference of distances at which two surfaces are considered in contact."""
 ASIDE = 2.0
-"""Distance from a contact line to which hits are moved, in multiples of a smallest distance. At the smallest distance,
-ray origins with their offset just lie in front of both surfaces."""
+"""Distance from a contact line to which hits are moved, relative to a minimum distance. At the minimum distance, offset
+ray origins just lie in front of both surfaces."""
 STEEPEST = 8.0
 """Cotangent of half the sharpest angle between two surfaces, 14 degrees, for which the distance above suffices."""
 

@@ -32,8 +32,7 @@ are in front of each other's tangent plane, or both are behind: most such surfac
 ANGLE = 1e-3
 """Smallest angle between two surfaces, in radians, that counts as an edge."""
 CRACK_BISECTIONS = 8
-"""Number of successive bisections without a move of the same end that suggest a crack. 1 in 2^7 true edges reaches it.
-"""
+"""An end that stays fixed in this many successive bisections suggests a crack. At true edges, 1 end in 2^7 does so."""
 PARTS = 3
 """Number of bisections in each half of a segment that locate the end of the differing part."""
 MIN_FRACTION = 9 / 32

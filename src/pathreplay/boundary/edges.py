@@ -1,4 +1,4 @@
-"""Edges: propagate their motion along the paths that see them, between the parameters or the camera and the image.
+"""Edges: propagate the motion of edges along the paths that see them, to and from the parameters and the camera.
 
 An edge is the zero set of a function B(ray, π), and moves with dB/dπ. The edge contributes to the derivative of the
 radiance at film position s

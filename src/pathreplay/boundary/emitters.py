@@ -81,7 +81,7 @@ class EmitterProbe:
     """The emitter sample at a position of the square, and the hit of its shadow ray."""
 
     light: mi.DirectionSample3f
-    Le: mi.Spectrum  # radiance over the density of the position
+    Le: mi.Spectrum  # radiance divided by the density of the position
     density: mi.Float  # density of emitter sampling in this direction
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f  # hit of the shadow ray, which may be the mesh emitter itself

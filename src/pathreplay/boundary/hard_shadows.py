@@ -24,7 +24,7 @@ class ShadowTest:
 
     u: mi.Point2f  # random numbers that select the light
     lit: mi.Bool  # a light was sampled, and it has no extent
-    Le: mi.Spectrum  # radiance over the probability of the light
+    Le: mi.Spectrum  # radiance divided by the probability of the light
     ray: mi.Ray3f  # towards the light
     hit: mi.PreliminaryIntersection3f
     outside: mi.Bool  # the point is outside a projector's image, or a cone without falloff

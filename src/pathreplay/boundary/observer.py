@@ -122,7 +122,7 @@ class ObserverVertex:
             # The flight is known, so that no sampler is needed.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # then, directions slide over facets
+        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # kept directions slide over facets
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
         """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium: see `fly_again`."""

@@ -50,7 +50,7 @@ class CameraPath:
 
 @dataclass(frozen=True)
 class SecondarySearch(EdgeSearch[CameraPath]):
-    """Edge search from path vertices, by segments of two ``lengths``: in the unit square, and on arcs (radians).
+    """Edge search from path vertices, with segments of two ``lengths``: in the unit square, and on arcs (radians).
 
     The search does not use the adjoint of the image, because forward mode has no adjoint and would select other
     segments.

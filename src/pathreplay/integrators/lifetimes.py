@@ -14,7 +14,7 @@ including the objects of other scenes. Four rules follow, which this module enfo
    hidden from the collector until the recording has ended.
 4. Only one Python thread renders at a time. All threads of a process share Dr.Jit's registry and memory. Threads that
    trace or launch kernels concurrently get wrong results or crash the process. A pass therefore raises an error if
-   another thread has one in progress; `exclusive` lets threads take turns.
+   another thread has a pass in progress; `exclusive` lets threads take turns.
 """
 
 from __future__ import annotations
@@ -91,9 +91,9 @@ def is_recording() -> bool:
 def exclusive() -> Iterator[None]:
     """Context that gives one Python thread exclusive use of the integrators of this package.
 
-    If several threads render, each must enclose all its use of Mitsuba and Dr.Jit: loading a scene, rendering,
-    `dr.backward`, optimiser steps, reading results. Other threads wait at their own `exclusive` blocks; without one,
-    their passes raise an error. All kernels have finished when the block ends.
+    If several threads render, each thread must enclose all its use of Mitsuba and Dr.Jit: loading a scene, rendering,
+    `dr.backward`, optimiser steps, reading results. Other threads wait at the start of their own `exclusive` blocks;
+    outside such blocks, their passes raise an error. All kernels have finished when the block ends.
     """
     with _ONE_THREAD:
         try:

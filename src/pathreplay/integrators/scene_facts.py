@@ -57,7 +57,7 @@ class SceneFacts:
 
     @property
     def has_seams(self) -> bool:
-        """Whether a texture has discontinuities. A recording assumes so unless an earlier pass has determined it."""
+        """Whether a texture has discontinuities. A recording assumes discontinuities if no earlier pass has looked."""
         if self._seams is None and not is_recording():
             self._seams = has_seams(self._textures)
         return self._seams is not False
@@ -105,8 +105,8 @@ class SceneFacts:
     def recorded_tables(self, known: Tables | None, edges: bool) -> Tables:
         """Return the tables of a pass that `dr.freeze` records.
 
-        Uses the ``known`` tables if they belong to this scene. Otherwise the recording computes the current tables,
-        including smoothing groups only if it searches for ``edges``.
+        Returns the ``known`` tables if they belong to this scene. Otherwise the recording computes the current tables,
+        which include smoothing groups only if the pass searches for ``edges``.
         """
         if known is not None and known is self._tables:
             return known

@@ -38,7 +38,7 @@ class StatefulIntegrator(Protocol):
         """Suppress these notes."""
 
     def is_recordable(self, has_media: bool) -> bool:
-        """Return whether `dr.freeze` is expected to record its passes."""
+        """Return whether `dr.freeze` is expected to record passes of this integrator."""
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool: ...
 

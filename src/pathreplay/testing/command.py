@@ -103,7 +103,7 @@ def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
 
 
 def _with_error(value: float, error: float) -> str:
-    """Format a value and its error as in '+0.03199 ± 0.00015', the error with two digits, both with equal decimals."""
+    """Format a value and its error, for example '+0.03199 ± 0.00015', with two significant digits of the error."""
     if not (math.isfinite(value) and math.isfinite(error)):
         return f"{value:+.4g}"
     if error == 0:

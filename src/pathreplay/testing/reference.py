@@ -24,8 +24,8 @@ NO_ROULETTE = 2**30
 """A ``rr_depth`` that no path reaches."""
 
 LONGEST_WITHOUT_ROULETTE = 64
-"""Largest ``max_depth`` at which the reference disables Russian roulette, without which paths in a closed room always
-reach ``max_depth``."""
+"""Largest ``max_depth`` at which the reference disables Russian roulette. Without roulette, paths in a closed room end
+only at ``max_depth``."""
 
 
 def integrator_under_test(
@@ -37,7 +37,7 @@ def integrator_under_test(
     selected by None, gets the path limits of the scene's own integrator. ``max_depth`` overrides their path length, and
     ``boundary`` contains additional properties of `pathreplay` (``boundary``, ``boundary_spp``).
 
-    Raises PathreplayError if Mitsuba cannot create it, if ``max_depth`` is invalid or given with a finished integrator,
+    Raises PathreplayError if Mitsuba cannot create the integrator, if ``max_depth`` is invalid or given with an object,
     or if boundary terms are requested from another integrator than `pathreplay`.
     """
     if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):

@@ -80,10 +80,10 @@ class FilmFlow(Protocol):
         """
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
-        """Return v: its value is zero, and it is attached to the parameters."""
+        """Return v, a value of zero that is attached to the parameters."""
 
     def divergence(self, sample: Sample) -> mi.Float:
-        """Return ∂v_x/∂x + ∂v_y/∂y: its value is zero, and it is attached to the parameters."""
+        """Return ∂v_x/∂x + ∂v_y/∂y, a value of zero that is attached to the parameters."""
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
         """Return whether the velocity at a film position may be non-zero."""
