@@ -1,4 +1,4 @@
-"""The command line: `pathreplay bench` or `python -m benchmarks [TASK ...]`, and `... report`."""
+"""The command line: `pathreplay bench` or `python -m benchmarks`, followed by names of tasks or by `report`."""
 
 from __future__ import annotations
 

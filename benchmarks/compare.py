@@ -96,7 +96,7 @@ def _place(machines: Sequence[Machine]) -> set[tuple[str, int, int]]:
 
 
 def _yardstick(key: Key, before: dict[Key, Point], now: dict[Key, Point]) -> tuple[Point, Point] | None:
-    """Mitsuba's method of the same job in both records, of the same stage ('prb, import') if there are stages."""
+    """Return the points of Mitsuba's method for the same job and stage (as in 'prb, import') in both records."""
     baselines = [
         other
         for other in before

@@ -256,7 +256,7 @@ def _label_ends(axes: Axes, labels: Sequence[tuple[float, float, str, str]], sid
 
 
 def _spread(heights: np.ndarray) -> np.ndarray:
-    """Move increasing heights as little as possible to be APART; each cluster keeps its mean."""
+    """Move increasing heights as little as possible to a distance of at least APART; each cluster keeps its mean."""
     clusters = [[height] for height in heights]
     k = 1
     while k < len(clusters):

@@ -4,8 +4,8 @@
 
 The command starts all nodes on this machine (`ray start`, with own ports, own folders, one core each, and a common
 secret token). It runs examples/cluster with an actor on each node, and once more in one process, and compares the
-results. The exit status is 1 if they differ. The nodes listen at this machine's address during the run. It takes about
-a minute on two quiet cores, and needs `pip install 'pathreplay[ray]'`.
+results. The exit status is 1 if the results differ. The nodes listen at this machine's address during the run. The
+command takes about a minute on two quiet cores, and needs `pip install 'pathreplay[ray]'`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ JOINED = """import ray, sys, time
 ray.init(address=sys.argv[1], log_to_driver=False, logging_level="error")
 while sum(node["Alive"] for node in ray.nodes()) < int(sys.argv[2]):
     time.sleep(0.2)"""
-"""Waits until a number of nodes have joined. Nodes start one by one: concurrent ones may take each other's ports."""
+"""Waits until a number of nodes have joined. Nodes start one by one: concurrent starts may claim the same ports."""
 
 
 def main(

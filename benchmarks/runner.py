@@ -82,7 +82,7 @@ def _run_job(job: Job, measured: Measured, show: Callable[[str, int], None]) -> 
 
 
 def _attempt(job: Job, measured: Measured, show: Callable[[str, int], None]) -> str | None:
-    """Run one worker process. Returns the method that killed it, if any; points of the others are discarded then."""
+    """Run one worker process. If a method kills it, keep only the error of this method, and return the method."""
     samples = {name: _Samples() for name in job.methods}
     running, peak, passes = job.methods[0], None, 0
     # With an empty kernel cache, the peak memory of every job includes compilation, not only that of some jobs.

@@ -5,7 +5,7 @@
 The command prints the modelled seconds of a step for 1 to 1000 devices, 10^6 to 10^9 parameters, and three ways to sum
 gradients. Then it simulates the first way with the scheduler of jobs (`pathreplay.distributed.scheduler`), for devices
 of different speeds, shards that get stuck, and devices that are lost. `--measure` first measures the costs on this
-machine; otherwise the constants below are used, which were measured in the same way. It takes a minute.
+machine. Otherwise the constants below are used, which were measured in the same way. The command takes a minute.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def simulated(costs: Costs, shards: int, devices: int, parameters: float, troubl
 
 @dataclass
 class _Devices:
-    """State of the devices between steps: one may still compute a shard that another has finished."""
+    """State of the devices between steps. A device may still compute a shard that another device has finished."""
 
     costs: Costs
     parameters: float

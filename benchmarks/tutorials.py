@@ -142,7 +142,7 @@ def measure(name: str, key: str, value: np.ndarray, truth: np.ndarray, like: Any
 
 
 def lines(name: str) -> tuple[int, int]:
-    """Lines of the loop (without head, docstring and the call of ``ready``), and of the config."""
+    """Count the lines of the loop (without head, docstring and the call of ``ready``) and of the config."""
     source = inspect.getsource(LOOPS[name][0]).split('"""', 2)[2].splitlines()
     config = (EXAMPLES / f"{name}.toml").read_text().splitlines()
     plain = [line for line in source if line.strip() not in ("", "ready()")]

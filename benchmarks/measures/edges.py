@@ -38,7 +38,7 @@ PICTURES = {"type": "path"}
 
 
 class Nothing:
-    """A term that is zero."""
+    """A term of the gradient that is zero, in place of the interior term."""
 
     def forward(self, *_: Any) -> TermResult:
         return TermResult()
@@ -117,7 +117,7 @@ class EdgePass:
         return self.integrators[name]
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """What the derivatives of all seeds say: see `spread`."""
+        """Return statistics of the derivatives of all seeds, by method: see `spread`."""
         return spreads(kept, None, ())
 
 
@@ -138,7 +138,7 @@ class NumberPass:
         self.forget()
 
     def forget(self) -> None:
-        """Create all integrators again."""
+        """Replace all integrators by new ones."""
         self.integrators: dict[str, Any] = {
             name: mi.load_dict((PICTURES if name == DIFFERENCE else METHODS[name]) | self.job.limits)
             for name in self.job.methods
@@ -155,7 +155,7 @@ class NumberPass:
         return objective.dot(objective.difference(integrator, CENTRAL, self.mover.step, seed, spp))
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """What the derivatives of all seeds say: see `spread`."""
+        """Return statistics of the derivatives of all seeds, by method: see `spread`."""
         return spreads(kept, None, ())
 
 

@@ -28,7 +28,7 @@ class Estimate:
 
 
 def interval(statistic: Callable[..., np.ndarray], *samples: Sequence[float] | np.ndarray, paired: bool) -> Estimate:
-    """Return a statistic with a bootstrap interval over rounds; ``paired`` samples are resampled by the same rounds."""
+    """Return a statistic with its bootstrap interval. If ``paired``, all samples are resampled at the same indices."""
     found = bootstrap(
         samples, statistic, paired=paired, n_resamples=RESAMPLES, method="percentile", vectorized=True, random_state=0
     ).confidence_interval
@@ -86,7 +86,7 @@ class Versus:
 
 
 def bias_share(bias_products: Sequence[float], squared_errors: Sequence[float]) -> Estimate:
-    """Return |bias|² over the variance of one pass. Its inverse is the number of passes after which bias exceeds noise.
+    """Return |bias|² / variance of one pass. The inverse is the number of passes after which bias exceeds noise.
 
     The interval is +- 1.96 standard errors of a U-statistic of order two (2 s / sqrt(n)). It is too wide where there is
     no bias.

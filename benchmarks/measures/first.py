@@ -1,8 +1,8 @@
 """Times one process from its start to its second gradient, and prints the seconds of each stage as one JSON list.
 
-`start.py` runs `python -m benchmarks.measures.first JOB`, where the only method of JOB is an integrator. To measure
-Mitsuba's integrators as their users run them, the process then imports neither pathreplay nor anything else that they
-do not need.
+`start.py` runs `python -m benchmarks.measures.first JOB`, where JOB has one method, an integrator. For an integrator of
+Mitsuba, the process imports only what this integrator needs, and in particular not pathreplay. The integrator is
+thereby measured as its users run it.
 """
 
 from __future__ import annotations

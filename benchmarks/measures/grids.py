@@ -89,7 +89,7 @@ def _controlled(grid: Any, bounds: Any, control: Any, denser: float) -> Any:
 
 
 def _with(control: Callable[[Any, Any], Any], denser: float) -> Callable[[Any], Any]:
-    """Cells of the fine level, with control densities that follow from it and the scale."""
+    """Return a function that makes cells of the fine level; ``control`` computes their control densities."""
     return lambda grid: _controlled(grid, _fine(grid), control(_fine(grid), grid.scale), denser)
 
 
@@ -114,7 +114,7 @@ def _sampler(seed: int, rays: int) -> Any:
 
 @dr.syntax
 def _first_collision(grid: Any, ray: Any, sampler: Any) -> tuple[Any, Any]:
-    """Distance of the first real collision, and the number of tentative ones."""
+    """Return the distance of the first real collision, and the number of tentative collisions."""
     active = mi.Bool(True)
     t, count = mi.Float(0), mi.UInt32(0)
     while dr.hint(active, exclude=[grid, ray]):
@@ -131,7 +131,7 @@ def _first_collision(grid: Any, ray: Any, sampler: Any) -> tuple[Any, Any]:
 
 
 def _lines(rays: int) -> Any:
-    """Rays that start outside of the unit cube and pass through a point in it, in all directions."""
+    """Return rays in all directions that start outside of the unit cube and pass through a point in the cube."""
     sampler = _sampler(1, rays)
     p = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d())
     d = mi.warp.square_to_uniform_sphere(sampler.next_2d())

@@ -36,7 +36,7 @@ def name_of(views: int, texels: int, memory: str = "") -> str:
 
 
 def _peak_since() -> float:
-    """Largest resident size (MiB) since this was asked for the last time; on Linux, elsewhere nothing is known."""
+    """Return the largest resident size (MiB) since the last call; NaN on systems other than Linux."""
     status, refs = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     if not status.exists():
         return float("nan")
@@ -94,7 +94,7 @@ class WholeRun(Measure):
         return {name: {"values": tuple(self.peaks)} for name in kept}
 
     def _written(self, folder: Path) -> dict[str, Any]:
-        """Scene, pictures and the job itself. The texture is refined to its size at once, so that none is read."""
+        """Write scene and images, and return the job. The texture gets its size by refinement, not from a file."""
         side = self.job.resolution
         views = "".join(_VIEW.format(i=i, x=0.02 * i - 1, side=side) for i in range(self.views))
         (folder / "scene.xml").write_text(_SCENE.format(views=views))

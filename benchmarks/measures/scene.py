@@ -56,7 +56,7 @@ class SceneMeasure:
 
 
 def _ad(value: Any) -> int | None:
-    """What Dr.Jit counts the variable of an array or a tensor as, None for other things."""
+    """Return Dr.Jit's AD index of an array or a tensor; None for other values."""
     return getattr(getattr(value, "array", value), "index_ad", None)
 
 

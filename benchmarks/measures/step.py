@@ -100,7 +100,7 @@ class Step:
         return seconds, np.ravel(run.optimiser.seen[self.key])  # type: ignore[attr-defined]
 
     def _usual(self, integrator: mi.Integrator, adam: drjit.opt.Adam, seed: int) -> tuple[float, np.ndarray]:
-        """The loop of Mitsuba's tutorials."""
+        """Time one step of the loop of Mitsuba's tutorials."""
         adam[self.key] = type(self.start)(self.start)
         self.params.update(adam)
 

@@ -25,7 +25,7 @@ def _axes(size: int) -> tuple[np.ndarray, ...]:
 
 
 def _noise(size: int, waves: int, seed: int) -> np.ndarray:
-    """Smooth noise of mean about 0 and deviation 1: ``waves`` random cosines of one to three lengths of the grid."""
+    """Return smooth noise of mean about 0 and deviation 1: a sum of ``waves`` random cosines of wavelength 1 to 3."""
     random = np.random.default_rng(seed)
     z, y, x = _axes(size)
     total = np.zeros_like(x)
@@ -80,7 +80,7 @@ def _body(medium: SceneDict, **more: Any) -> SceneDict:
 
 
 def _sun_and_sky() -> SceneDict:
-    """A dim sky of radiance 0.1 to 0.25 and a sun of 5 degrees and 1000: it gives three quarters of the light."""
+    """A dim sky of radiance 0.1 to 0.25, and a sun of 5 degrees and radiance 1000 with three quarters of the light."""
     v, u = np.mgrid[0:128, 0:256].astype(np.float32)
     v, u = (v + 0.5) / 128, (u + 0.5) / 256
     sky = np.where(v < 0.5, 0.15 + 0.2 * v, 0.1)[..., None] * np.array([0.7, 0.85, 1.0])

@@ -56,13 +56,13 @@ def _slide_vertices(value: Any, t: mi.Float) -> Any:
 
 
 def _rise(value: Any, t: mi.Float) -> Any:
-    """Heights grow in proportion."""
+    """Scale all heights by 1 + t."""
     p = dr.unravel(mi.Point3f, value)
     return dr.ravel(mi.Point3f(p.x, p.y, p.z * (1 + t)))
 
 
 def _widen(value: Any, t: mi.Float) -> Any:
-    """Degrees."""
+    """Increase a field of view by 50 t degrees."""
     return value + 50 * t
 
 
@@ -83,7 +83,7 @@ def _texture(low: float, high: float) -> SceneDict:
 
 
 def _environment() -> SceneDict:
-    """Clouds, and a sun of some degrees."""
+    """An environment map of random radiance, with a sun."""
     texels = np.random.default_rng(5).uniform(0.1, 1, (16, 32, 3)).astype(np.float32)
     texels[4:6, 20:22] = 20
     return {"type": "envmap", "bitmap": mi.Bitmap(texels)}
@@ -114,7 +114,7 @@ def _box() -> SceneDict:
 
 
 def _head(at: list[float], size: float) -> mi.Mesh:
-    """A bumpy ball, with cups for ears, and balls for eyes that are stuck into sockets."""
+    """A bumpy ball with cup-shaped ears and spherical eyes in sockets."""
     parts = [
         ball_with_bumps(
             HEAD, ((0, -0.4, 1), 0.4, 0.15), ((-0.35, 0.25, 0.9), -0.2, 0.05), ((0.35, 0.25, 0.9), -0.2, 0.05)
@@ -131,7 +131,7 @@ def _head(at: list[float], size: float) -> mi.Mesh:
 
 
 def _ear(side: float) -> tuple[np.ndarray, np.ndarray]:
-    """A thin cup that opens to the front: a ball that is pressed flat, and bent."""
+    """Return vertices and faces of a flattened, bent ball: a thin cup that opens to the front."""
     ball, faces = ball_with_bumps(HEAD // 4)
     x, y, z = ball.T
     flat = np.stack([0.5 * x + 1.2 * side, 0.5 * y + 0.35, 0.08 * z + 0.9 * (0.25 * (x * x + y * y)) - 0.1], 1)
@@ -152,7 +152,7 @@ def _heights() -> mi.Mesh:
 def _scene(
     camera: Callable[[int], SceneDict] | None = None, /, **parts: Callable[[], Any]
 ) -> Callable[[int], SceneDict]:
-    """Parts are made anew for each scene."""
+    """Return a function from the resolution to a scene, which creates new parts for each scene."""
     camera = camera or (lambda n: sensor(n, [0, 0, 4], [0, 0, 0], 40, up=(0, 1, 0)))
     return lambda n: {"type": "scene", "camera": camera(n), **{name: make() for name, make in parts.items()}}
 

@@ -11,7 +11,7 @@ from .parts import SceneDict, sensor
 
 
 def _texture(size: int, low: float, high: float) -> SceneDict:
-    """Random texels between ``low`` and ``high``: no two alike, so that nothing averages out by symmetry."""
+    """A texture of random texels between ``low`` and ``high``. All differ, so that errors cannot cancel by symmetry."""
     texels = np.random.default_rng(0).uniform(low, high, (size, size, 3)).astype(np.float32)
     return {"type": "bitmap", "data": mi.TensorXf(texels), "raw": True}
 
@@ -96,7 +96,7 @@ def closed_box(resolution: int) -> SceneDict:
 
 
 def _boxed(make: Callable[[int], SceneDict]) -> Callable[[int], SceneDict]:
-    """The scene with a box filter on its film; Mitsuba's Cornell box has a gaussian one."""
+    """Return a function that makes the scene with a box filter; Mitsuba's Cornell box has a Gaussian filter."""
 
     def boxed(resolution: int) -> SceneDict:
         scene = make(resolution)

@@ -30,7 +30,7 @@ def _texture(texels: np.ndarray) -> SceneDict:
 
 
 def _sky(height: int = 64) -> SceneDict:
-    """A smooth sky without edges: whatever moves under it has no silhouette but its own."""
+    """A smooth sky without edges, under which only the silhouettes of moving objects are discontinuities."""
     v, u = np.mgrid[0:height, 0 : 2 * height] * (np.pi / height)
     waves = [np.cos(u) * np.sin(v) / 2, np.sin(u + 1) * np.sin(v) / 2, np.cos(2 * u) * np.sin(v) / 3]
     return {"type": "envmap", "bitmap": mi.Bitmap((1 + np.stack(waves, axis=-1)).astype(np.float32))}
@@ -60,13 +60,13 @@ def _room(texels: np.ndarray) -> SceneDict:
 
 
 def _ball(bsdf: SceneDict) -> SceneDict:
-    """A ball that fills the picture, under the sky."""
+    """A ball under the sky that fills the image."""
     ball = {"type": "sphere", "bsdf": bsdf}
     return {"type": "scene", "camera": _camera([0, 0, 5], 10), "sky": _sky(), "object": ball}
 
 
 def _waves() -> SceneDict:
-    """A diffuse plane with a smooth texture, larger than the picture."""
+    """A diffuse plane with a smooth texture that extends beyond the image."""
     y, x = np.mgrid[0:64, 0:64] / 64 * 2 * np.pi
     texels = 0.5 + 0.3 * np.stack([np.sin(x), np.cos(y), np.sin(x + y)], axis=-1)
     bsdf = {"type": "diffuse", "reflectance": _texture(texels)}
@@ -85,7 +85,7 @@ def _waving(low: float, high: float, channels: int = 1) -> np.ndarray:
 
 
 def _checkers() -> np.ndarray:
-    """Full and empty blocks of three voxels a side: interpolation leaves pure ones of both kinds."""
+    """Full and empty blocks of 3³ voxels. Points in their centres are full or empty in spite of interpolation."""
     z, y, x = np.mgrid[0:VOXELS, 0:VOXELS, 0:VOXELS] // 3
     return 2.0 * ((x + y + z) % 2)[..., None]
 
@@ -120,7 +120,7 @@ def _cloud(medium: SceneDict, **more: Any) -> SceneDict:
 
 
 def _sunlit_cloud() -> SceneDict:
-    """Lit from behind: what is scattered forwards is seen."""
+    """A cloud lit from behind, so that the camera sees light that is scattered forwards."""
     sun = {"type": "directional", "direction": [0.3, -0.6, 1], "irradiance": _rgb(4, 3, 2)}
     return _cloud(_grid(_waving(0.4, 2), _waving(0.3, 0.9), g=0.5), sky=sun)
 

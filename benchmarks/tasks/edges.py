@@ -5,7 +5,7 @@ edges: edges that the camera sees, or edges that surfaces see. Edge lists are co
 an emissive wall. In other scenes they omit creases and shade the wrong faces (see docs/edges_peers.md).
 
 The task also compares derivatives with respect to one number, interior and boundary terms together, with central
-differences with common random numbers, the method for which no gradients are needed.
+differences. These differences use common random numbers, and are the usual method without gradients.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def _times(point: Point, baseline: Point | None) -> list[str]:
 
 
 def _both(point: Point, baseline: Point) -> tuple[Point, Point]:
-    """Two points with the rounds that both have."""
+    """Return the two points, restricted to the rounds that both contain."""
     n = min(len(point.seeds), len(baseline.seeds))
     point, baseline = (
         replace(p, seconds=p.seconds[:n], squared_errors=p.squared_errors[:n]) for p in (point, baseline)
