@@ -148,8 +148,7 @@ def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes:
 
 
 def _deepest(described: Described, owner: Owner) -> Owner:
-    """Follow the place of a parameter to the innermost object, such as a bitmap, whose instance does not keep its
-    id."""
+    """Follow the place of a parameter to the innermost object, such as a bitmap, whose instance loses its id."""
     name, dot, rest = owner.place.partition(".")
     if not dot:
         return owner
