@@ -32,8 +32,7 @@ from pathreplay.platform.interrupts import undisturbed
 OLDEST = (2, 60)
 """First version of Ray whose token authentication covers clusters that a program starts."""
 
-# Variable that allows several machines. If it is off, as by default on systems with blocking firewalls, Ray uses
-# loopback addresses.
+# If this variable is off, Ray uses loopback addresses. Ray has the variable for systems whose firewalls block clusters.
 _MANY_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _MODE, _TOKEN, _ADDRESS = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"
 _LONGEST_FOLDER = 20
