@@ -2,8 +2,8 @@
 
 Exit status 0 means success, 1 a negative result (a gradient fails its check, or no variant runs on this machine), and 2
 an error that the user has to fix. If a signal ends the command, the status is 128 plus the signal number (130 for
-Ctrl-C). A signal does not fail `optimize`, which writes its results and exits with 0. Heavy modules are imported inside
-the commands, so that `pathreplay --help` responds immediately.
+Ctrl-C). After a signal, `optimize` writes its results and exits with 0. Heavy modules are imported inside the commands,
+so that `pathreplay --help` responds immediately.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _UsageError: Any = typer.BadParameter.__base__
 
 
 class _Ended(BaseException):
-    """Carries a KeyboardInterrupt through typer to `_run`, as its cause."""
+    """Wraps a KeyboardInterrupt for `_run`, because typer would handle the KeyboardInterrupt itself."""
 
 
 class _Commands(typer.core.TyperGroup):
@@ -283,8 +283,7 @@ _HAS_BENCHMARKS = (_CHECKOUT / "benchmarks" / "__main__.py").is_file()
 
 
 # `python -m benchmarks` parses the options and prints its own help. It runs in the current folder, so that relative
-# paths resolve as usual. The wheel contains no benchmarks; after its installation `pathreplay --help` omits the
-# command.
+# paths resolve as usual. The wheel contains no benchmarks, and its `pathreplay --help` omits the command.
 @app.command(
     short_help="Measure time, memory, noise and correctness.",
     hidden=not _HAS_BENCHMARKS,

@@ -41,8 +41,8 @@ class RenderFunction(SceneFunction):
     def initial_values(self) -> dict[str, jax.Array]:
         """Return the parameter values that the scene had when it was loaded.
 
-        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices
-            (3n,), transforms (4, 4).
+        Shapes are (height, width, channels) for textures, (z, y, x, channels) for grids, (3,) for colours, (n,) for n
+        numbers, (3n,) for n vertices, and (4, 4) for transforms.
         """
         return {key: jnp.asarray(value) for key, value in self._start.items()}
 
@@ -59,7 +59,7 @@ class RenderFunction(SceneFunction):
             values: arrays by parameter key, in the shapes of `initial_values`.
             sensor: index of the sensor.
             seed: seed of the samples, which should change in every step; may be an array in compiled functions.
-            spp: samples per pixel; default: those of this object.
+            spp: samples per pixel; default: ``spp`` of this object.
 
         Raises:
             PathreplayError: a value is missing or has the wrong shape. JAX reports errors of the integrator as callback

@@ -25,8 +25,7 @@ Tensors = Mapping[str, torch.Tensor]
 class RenderFunction(SceneFunction):
     """Images of a scene as a function of some of its parameters; see `SceneFunction` for the arguments.
 
-    Tensors are float32 on ``device``, which is the GPU in CUDA variants and the CPU otherwise. Other tensors are
-    converted.
+    Tensors are float32 on ``device``: the GPU in CUDA variants, otherwise the CPU. Other tensors are converted.
     """
 
     @cached_property
@@ -37,8 +36,8 @@ class RenderFunction(SceneFunction):
     def initial_values(self) -> dict[str, torch.Tensor]:
         """Return the parameter values that the scene had when it was loaded.
 
-        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices
-            (3n,), transforms (4, 4).
+        Shapes are (height, width, channels) for textures, (z, y, x, channels) for grids, (3,) for colours, (n,) for n
+        numbers, (3n,) for n vertices, and (4, 4) for transforms.
         """
         return {key: torch.tensor(value, device=self.device) for key, value in self._start.items()}
 
@@ -53,7 +52,7 @@ class RenderFunction(SceneFunction):
             values: tensors by parameter key, in the shapes of `initial_values`.
             sensor: index of the sensor.
             seed: seed of the samples, which should change in every step.
-            spp: samples per pixel; default: those of this object.
+            spp: samples per pixel; default: ``spp`` of this object.
 
         Raises:
             PathreplayError: a value is missing or has the wrong shape, or the integrator does not support an operation.

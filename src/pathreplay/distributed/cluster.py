@@ -258,7 +258,7 @@ def _private_environment(ray: ModuleType) -> Iterator[None]:
     many = constants.ENABLE_RAY_CLUSTER
     os.environ.update(settings)
     constants.ENABLE_RAY_CLUSTER = False
-    ray._raylet.Config.initialize("")  # read the environment again, and below the token
+    ray._raylet.Config.initialize("")  # make Ray read the settings again, and the token below
     ray._raylet.AuthenticationTokenLoader.instance().reset_cache()
     try:
         yield

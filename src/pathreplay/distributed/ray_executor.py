@@ -30,7 +30,7 @@ from pathreplay.inverse.problem.problem import Problem
 from pathreplay.scenes.descriptions import one_line
 
 THREADS = 4
-"""Largest default number of threads per actor. More help little, because Python traces the kernels in one thread."""
+"""Largest default number of threads per actor. More threads help little: Python traces the kernels in one thread."""
 
 SMALL = 2**16
 """Bytes. Smaller arrays are sent with each request, which is faster than fetching them from the object store."""
@@ -89,7 +89,7 @@ class WorkerPool:
     """Receives the progress of the current step."""
     counts: Counts = field(default_factory=Counts)
     schedulers: list[Scheduler] = field(default_factory=list)
-    """One per executor."""
+    """The scheduler of each executor."""
     calls: dict[Reference, _Call] = field(default_factory=dict)
     """Pending requests by Ray's reference to the answer."""
     ready: dict[int, Ready] = field(default_factory=dict)
@@ -119,7 +119,7 @@ class WorkerPool:
     def answered(self, patience: float) -> list[tuple[_Call, Reference]]:
         """Wait at most ``patience`` seconds for an answer; return answered requests, with references to the answers.
 
-        The requests are no longer pending. Raises PathreplayError if the cluster is lost.
+        Answered requests are removed from ``calls``. Raises PathreplayError if the cluster is lost.
         """
         end = time.monotonic() + patience
         ready: list[Reference] = []
@@ -172,7 +172,7 @@ class WorkerPool:
             )
 
     def _lost(self, call: _Call, error: Exception) -> None:
-        """Initialize a lost actor again, or remove it if Ray restarts it no more.
+        """Initialize a lost actor again, or remove it if Ray will not restart it again.
 
         Raises PathreplayError if no actor is left.
         """

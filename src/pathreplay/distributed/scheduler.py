@@ -1,9 +1,10 @@
-"""Assigns the shards of a step (an iteration) to actors, based on measured durations; results do not depend on this.
+"""Assigns the shards of a step to actors, based on measured durations. Results do not depend on the assignment.
 
-Each actor evaluates the same views in every step, because it has compiled their kernels. An actor that has finished its
-own shards takes one from the actor with the most remaining work, so that all actors finish at about the same time. If
-no shard is waiting, an idle actor also computes a shard that takes much longer than expected, and the first result
-counts. Short shards share one request, because each request has a fixed cost.
+A step is an iteration of the optimisation. Each actor evaluates the same views in every step, because it has compiled
+their kernels. An actor that has finished its own shards takes one from the actor with the most remaining work, so that
+all actors finish at about the same time. If no shard is waiting, an idle actor also computes a shard that takes much
+longer than expected, and the first result counts. Short shards share one request, because each request has a fixed
+cost.
 """
 
 from __future__ import annotations
@@ -155,7 +156,12 @@ class Step:
     def next(self, actor: Actor, now: float, idle: Collection[Actor]) -> int | None:
         """Choose the next shard of an idle actor, mark it as running, and return its index.
 
-        Returns None if the actor should not start a shard now. ``idle`` are all idle actors, and ``now`` is the time.
+        Returns None if the actor should not start a shard now.
+
+        Args:
+            actor: the idle actor.
+            now: the current time.
+            idle: all idle actors.
         """
         for owner in (actor, None):
             if self.waiting.get(owner):
@@ -186,7 +192,7 @@ class Step:
 
         The time of a request is limited to a fraction of the actor's remaining work, and to the step's work divided by
         the number of ``actors``. Requests therefore become shorter towards the end of a step, and all actors finish at
-        about the same time. The number of shards is limited by `TOGETHER`, where a gradient has ``size`` bytes.
+        about the same time. `TOGETHER` limits the number of shards, whose gradients have ``size`` bytes each.
         """
         waiting, request = self.waiting.get(actor, []), self.running[actor]
         if not self.scheduler.holds(actor, self.kinds[request.shards[0]]):

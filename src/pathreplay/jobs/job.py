@@ -27,7 +27,7 @@ def optimize(
 ) -> RunResult:
     """Recover the parameters of a job, and write its run folder.
 
-    The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration, with everything written. A further
+    The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration, with all results written. A further
     Ctrl-C aborts the run (KeyboardInterrupt). Until the run folder exists, signals keep their previous handlers. A
     ``deterministic`` job uses a single thread; the previous number of threads is restored afterwards.
 

@@ -28,9 +28,9 @@ class Optimization:
     """A running job: iterating over it yields an `Iteration` after each step.
 
     The scene is loaded when the first iteration is requested. At the end of the loop, all results are written and
-    ``result`` is set. `stop` ends the run early and also writes all results. `close`, which the end of a ``with`` block
-    calls, and leaving the loop early only write a checkpoint to resume from. `pathreplay.optimize` describes the effect
-    of signals.
+    ``result`` is set. `stop` ends the run early and also writes all results. `close` ends the run with only a
+    checkpoint to resume from; leaving the loop early or a ``with`` block has the same effect. `pathreplay.optimize`
+    describes the effect of signals.
     """
 
     def __init__(self, job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> None:

@@ -64,8 +64,8 @@ class Parameter:
 class Derived:
     """A scene parameter that a function computes from other parameters.
 
-    Its value is ``function(initial, *inputs)``: the value in the scene, and the values of the parameters named in
-    ``of``.
+    Its value is ``function(initial, *inputs)``, where ``initial`` is the value in the scene and ``inputs`` are the
+    values of the parameters named in ``of``.
     """
 
     function: Callable[..., object] | str

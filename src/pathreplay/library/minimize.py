@@ -85,11 +85,11 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
 
     Args:
         problem: the problem. Afterwards its scene has the resulting values.
-        optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"`` or ``"l-bfgs-b"``; a mapping with
-            ``type`` and options; an optimizer of `mitsuba.ad`; an object with a method ``step(values, gradients,
-            learning_rates, loss) -> values``, whose arrays are by name; or a function like `scipy.optimize.minimize`,
-            such as ``functools.partial(scipy.optimize.minimize, method="SLSQP")``. An optimizer of `mitsuba.ad` must be
-            empty; its learning rate applies to parameters without their own. Functions support up to 1000 entries.
+        optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"``, ``"l-bfgs-b"``, or a mapping with
+            ``type`` and options. An optimizer of `mitsuba.ad` must be empty; its learning rate applies to parameters
+            without their own. Any other object needs ``step(values, gradients, learning_rates, loss) -> values``, with
+            arrays by name. A function needs the interface of `scipy.optimize.minimize`, such as
+            ``functools.partial(scipy.optimize.minimize, method="SLSQP")``, and supports up to 1000 entries.
         steps: number of iterations. Default: ``iterations`` of the problem's job, or 200.
         callbacks: functions that are called with an `Iteration` after each step; one that returns True stops the loop.
         progress: show a bar on a terminal, the loss curve and images in a notebook, or lines elsewhere.
@@ -106,8 +106,7 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         **settings: further keys of a job, such as ``checkpoint_every``, ``preview`` or ``spp`` (docs/job-reference.md).
 
     Returns:
-        Values and history, and the reason if the run ended early. The first Ctrl-C ends the run after the current
-        iteration.
+        Values and history, and why the run ended early, if so. The first Ctrl-C ends it after the current iteration.
 
     Raises:
         PathreplayError: settings are invalid, loss or values are not finite, or the folder is in use, damaged, or

@@ -97,7 +97,7 @@ def _leaves(tree: object) -> list[dr.ArrayBase]:
 
 
 def _with_leaves(tree: object, leaves: Iterator[dr.ArrayBase]) -> Any:
-    """Replace the arrays of nested tuples."""
+    """Replace the arrays of nested tuples by ``leaves``, in order."""
     if isinstance(tree, tuple):
         return tuple(_with_leaves(branch, leaves) for branch in tree)
     return next(leaves) if dr.is_array_v(tree) else tree
@@ -174,7 +174,7 @@ def _rated(problem: Problem) -> set[str]:
 def options_of(optimizer: object) -> tuple[Json | None, object]:
     """Return the options of the job's ``optimizer``, and the user's optimizer object or search function.
 
-    Each is None if it does not apply. A search function also has options, with the type of search methods. Raises
+    Either is None if it does not apply. A search function also has options, with the type of search methods. Raises
     PathreplayError for any other object.
     """
     if optimizer is None or isinstance(optimizer, str):

@@ -40,15 +40,16 @@ OF_A_PROBLEM = frozenset(
 
 
 class Problem:
-    """Minimisation of the mean over views of ``loss(render(scene, view), target)`` over scene parameters.
+    """An inverse problem: minimise the mean of ``loss(render(scene, view), target)`` over all views.
 
-    The scene is not copied, and has the values of the last evaluation. The integrator's boundary terms differentiate
-    visibility. Sampling decisions, Russian roulette and targets are not differentiated.
+    The unknowns are scene parameters. The scene is not copied, and has the values of the last evaluation. The
+    integrator's boundary terms differentiate visibility. Sampling decisions, Russian roulette and targets are not
+    differentiated.
 
     Args:
-        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. Unless it is
-            loaded already, differentiable plugins replace each ``dielectric`` whose index is a parameter, and 8-bit
-            textures that are parameters.
+        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. Unless the scene
+            is already loaded, `dielectric_ad` replaces each ``dielectric`` if an index is a parameter, and 8-bit
+            textures that are parameters are loaded as floating-point numbers.
         parameters: options by parameter key of ``mi.traverse(scene)`` or glob, or a sequence of keys without options.
         views: sensors and their targets.
         loss: a name (see `pathreplay.losses`), or ``loss(image, target)`` on tensors of shape (height, width, channels)
@@ -214,7 +215,7 @@ class Problem:
             name: start of error messages.
 
         Returns:
-            The problem with its own settings, replaced by the changes.
+            A problem with the same scene and targets, and with the job's settings overridden by the changes.
 
         Raises:
             PathreplayError: a setting is invalid, or fixed when the problem is created.
@@ -265,7 +266,10 @@ def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
 
 
 def _loaded(scene: object, job: Json, base: Path) -> tuple[mi.Scene, tuple[str, ...]]:
-    """Return a loaded scene, with differentiable plugins for the job's parameters, and notes (see `load_scene_for`)."""
+    """Load a scene so that the job's parameters are differentiable; returns the scene and notes on changes.
+
+    A loaded scene is returned unchanged. See `load_scene_for`.
+    """
     if isinstance(scene, mi.Scene):
         return scene, ()
     if not isinstance(scene, (Mapping, str, Path)):

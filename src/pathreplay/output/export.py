@@ -73,7 +73,7 @@ def export_run(run: Path, output: Path | None = None) -> str:
             (part / name).write_bytes(data)
         require_same(export.scene, part)
     files = sorted([*export.files, *export.copies])
-    # The command `mitsuba` would load the system's newest LLVM, which crashes it in some versions.
+    # The command `mitsuba` would load the system's newest LLVM, and some versions of LLVM crash Mitsuba.
     render = f"pathreplay render {shlex.quote(str(folder / SCENE))} -o scene.exr --variant {mi.variant()}"
     lines = [f"{folder / SCENE}: render it with `{render}`"]
     lines += [f"{folder / name}" for name in files if name != SCENE and not name.startswith("files/")]
@@ -94,7 +94,7 @@ def write_files(export: Exported, folder: Path) -> None:
 
 
 def _result(run: Path) -> dict[str, np.ndarray]:
-    """Return the decoded parameter values at the end of a run. Raises PathreplayError if there are none."""
+    """Return the decoded parameter values at the end of a run. Raises PathreplayError if the run has no result."""
     path = run / "parameters.safetensors"
     if not path.is_file():
         raise PathreplayError(
@@ -142,7 +142,7 @@ def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
 def _beside(export: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
     """Return the content of the files that the scene does not reference, by name: PNG, OBJ, NPY, cameras, and numbers.
 
-    ``free`` are parameters outside the scene. Those of more than 16 numbers become NPY files.
+    ``free`` are parameters outside the scene; if they have more than 16 numbers, they become NPY files.
     """
     params, files = mi.traverse(export.scene), {"transforms.json": _json(_cameras(export.scene))}
     names = file_names([*params.keys(), *(shape.id() for shape in export.scene.shapes())])

@@ -148,7 +148,10 @@ def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes:
 
 
 def _deepest(described: Described, owner: Owner) -> Owner:
-    """Follow the place of a parameter to the innermost object, such as a bitmap, whose instance loses its id."""
+    """Follow the place of a parameter to the innermost object.
+
+    `_owners` misses some objects: for example, the instance of a bitmap does not keep its id.
+    """
     name, dot, rest = owner.place.partition(".")
     if not dot:
         return owner

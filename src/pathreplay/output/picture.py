@@ -20,8 +20,7 @@ from pathreplay.inverse.images.io import Image, png_bytes
 from pathreplay.platform import memory
 from pathreplay.scenes.descriptions import errors_as
 
-# Samples per pass of the `independent` sampler. A pass takes a few seconds, so that the bar moves and Ctrl-C takes
-# effect.
+# Samples per pass of the `independent` sampler. Passes take a few seconds, so that bar and Ctrl-C respond soon.
 _A_PASS = 2**24
 # Bytes per sample during a pass, for two copies of the state of its random number generator.
 _A_SAMPLE = 64
@@ -34,7 +33,10 @@ Told = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Rendering:
-    """A rendered image: linear pixels (height, width, channels), and channel names: R, G, B, A, Y, or names of AOVs."""
+    """A rendered image with linear pixels (height, width, channels).
+
+    The names of the ``channels`` are R, G, B, A and Y, or those of AOVs.
+    """
 
     image: Image
     channels: tuple[str, ...]
@@ -106,7 +108,7 @@ def render(
 
     Args:
         scene: scene to render.
-        sensor: one of its sensors.
+        sensor: sensor of the scene.
         integrator: any integrator.
         spp: samples per pixel, which some samplers round up.
         seed: seed of the first pass, from which the seeds of further passes are derived.

@@ -36,8 +36,7 @@ _STANDS_IN = {"dielectric_ad": "dielectric"}
 _DEPTHS = {"direct_projective": 2} | dict.fromkeys(
     ("pathreplay", "prb", "prb_basic", "prb_projective", "rb", "prbvolpath"), 6
 )
-"""Default depth of each differentiable integrator; in the exported scene `path` or `volpath` replaces the
-integrator."""
+"""Default depths of the differentiable integrators, which `path` or `volpath` replaces in exported scenes."""
 _KEPT = ("max_depth", "rr_depth", "hide_emitters")
 """Properties that `path` and `volpath` share with differentiable integrators."""
 
@@ -189,7 +188,7 @@ def _plain_plugins(described: Described) -> list[str]:
 
 
 def _plain_integrator(described: Described, wanted: Mapping[str, object] | None) -> list[str]:
-    """Set the ``wanted`` integrator; None keeps that of the scene.
+    """Set the ``wanted`` integrator; default: the scene's, or `pathreplay` if the scene has none.
 
     `path` or `volpath` replaces a differentiable integrator; a returned note says so.
     """

@@ -21,9 +21,8 @@ from pathreplay.platform import memory
 SHARE = 0.25
 """Fraction of GPU memory that records may take; the rest is for the scene, the film and other processes."""
 LARGEST_LOCAL = 56 * 1024
-"""Largest number of bytes of local memory per CUDA thread. OptiX provides a stack of 64 KiB, and an overflow crashes
-the
-process. Records of 560 x 96 bytes fit; records of 700 x 96 bytes do not."""
+"""Largest number of bytes of local memory per CUDA thread. OptiX provides a stack of 64 KiB, and crashes the process if
+the stack overflows. A record of 560 x 96 bytes fits; a record of 700 x 96 bytes does not."""
 FEWEST_RECORDS = 9
 """Smallest number of records allocated on a GPU. Arrays of up to eight entries are kept in registers, where dynamic
 indexing makes a pass more than twice as slow."""

@@ -14,8 +14,7 @@ from pathreplay.errors import PathreplayError
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Seconds. Signals within this interval count as one request: a second signal must not interrupt the reaction to the
-# first.
+# Seconds. Signals within this interval count as one: a second signal must not interrupt the reaction to the first.
 ONE_WISH_S = 1.0
 
 _raised_at: list[float] = []  # time at which a signal handler last raised an exception

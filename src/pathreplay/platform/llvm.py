@@ -63,8 +63,7 @@ def pip_library() -> str | None:
         files = importlib.metadata.files(PIP_DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:
         return None
-    # Use the file instead of its symbolic links, which are created only at the first start of Python after
-    # installation.
+    # Use the file instead of its links, which are created only at the first start of Python after installation.
     paths = (Path(str(f.locate())).resolve() for f in files if re.fullmatch(r"libLLVM\.so\.[\d.]+", f.name))
     return next((str(path) for path in paths if path.is_file()), None)
 
@@ -138,8 +137,7 @@ def candidates() -> Iterator[tuple[str, str]]:
             yield path, origin
 
 
-#: Start of every test program: use the parent's sys.path, write no core dump (a crash is a valid result), load
-#: libraries.
+#: Start of every test: set the parent's sys.path, disable core dumps (a crash is a valid result), load libraries.
 _BEGIN = """
 import ctypes, json, sys
 task = json.loads(sys.argv[1])

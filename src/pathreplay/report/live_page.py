@@ -263,7 +263,7 @@ class Previews:
 
 
 def _grids(item: Recovered) -> dict[str, Image]:
-    """Return initial value and truth (if known) of a texture or a volume as images by kind; otherwise nothing."""
+    """Return initial value and truth (if known) of a texture or volume as images; empty for other parameters."""
     return {kind: image for kind, image in (item.textures() or item.volumes()).items() if kind in ("start", "truth")}
 
 
@@ -280,8 +280,7 @@ def frames(run: Path) -> Iterator[tuple[int, str, Path]]:
 def films(run: Path, most_bytes: int | None = None) -> dict[str, tuple[Still, ...]]:
     """Return the film frames of a run by subject.
 
-    With ``most_bytes``, frames are data URIs and are thinned to this total size. Without it, they are relative
-    addresses.
+    With ``most_bytes``, frames are data URIs, thinned to this total size. Otherwise, they are relative addresses.
     """
     stills_of: dict[str, list[tuple[int, Path]]] = {}
     for iteration, what, path in frames(run):

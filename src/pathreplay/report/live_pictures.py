@@ -61,7 +61,7 @@ class LivePictures:
         """Number of completed iterations at the latest images."""
 
     def observe(self, event: Event) -> None:
-        """Render images if they are due. For runs without a live page, which would do this itself."""
+        """Render images if they are due. Only for runs without a live page: `Previews` calls the other methods."""
         if isinstance(event, Stepped) and self.is_due(event.entry.seconds):
             begin = time.perf_counter()
             with self._problem.computing():
@@ -70,7 +70,7 @@ class LivePictures:
 
     def is_due(self, seconds: float) -> bool:
         """Return whether images are due after an iteration that took ``seconds``."""
-        # The cost of the first images is not known. The cost of an iteration is an upper estimate.
+        # The cost of the first images is unknown, and is estimated by the cost of an iteration, which is larger.
         allowed = self.share * (time.perf_counter() - self._began)
         return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
 

@@ -59,8 +59,8 @@ def facts(config: Config, history: Sequence[Entry]) -> tuple[tuple[str, str], ..
 def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
     """Return plots over the iterations.
 
-    There is a plot of the loss, and plots for each parameter of its error (if the truth is known), and of the norms of
-    its gradient and gradient noise. Regularizers and samples per pixel are plotted if they are present or vary.
+    One plot shows the loss. For each parameter, plots show its error (if the truth is known), and the norms of its
+    gradient and gradient noise. Regularizers are plotted if present, and samples per pixel if they vary.
     """
     entries = [history[i] for i in thinned(len(history))]
     x = tuple(float(entry.iteration) for entry in entries)

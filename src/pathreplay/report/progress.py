@@ -20,7 +20,7 @@ _SECONDS = 10.0
 class _Forgiving:
     """Stream that writes to stderr and ignores errors: a closed terminal must not keep a run from writing its results.
 
-    Ignored are write errors, a missing stderr (None in a program without a console), and the RuntimeError that Python
+    It ignores write errors, a missing stderr (None in a program without a console), and the RuntimeError that Python
     raises if a signal handler prints while the interrupted code is printing.
     """
 

@@ -22,9 +22,9 @@ LOCK = "lock"
 class FolderLock:
     """Locks a file in ``folder`` from construction to `close`.
 
-    The file remains when the lock is released; its existence means nothing. The system releases the lock (flock) when
-    the process ends for any reason. Without support for flock in the file system or the operating system, nothing is
-    locked.
+    The file remains when the lock is released, and does not by itself lock the folder. The system releases the lock
+    (flock) when the process ends for any reason. If the file system or the operating system does not support flock,
+    nothing is locked.
 
     Raises PathreplayError if another process or thread holds the lock, or if the folder cannot be written.
     """

@@ -62,8 +62,7 @@ class RunFolder:
 
     Args:
         given: path of the folder, absolute or relative to ``home``.
-        home: folder to which ``given`` refers; default: the current folder. A later change of the current folder has no
-            effect.
+        home: folder to which ``given`` refers; default: the folder that is current at construction.
         in_python: whether the job has Python objects; see `Job`.
     """
 
