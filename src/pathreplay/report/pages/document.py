@@ -46,7 +46,7 @@ def document(page: Page, live: bool = False) -> bytes:
 
 
 def policy(pictures: str, connect: str = "'none'") -> str:
-    """Return a Content-Security-Policy that allows only the style and script of this package, and some sources.
+    """Return a Content-Security-Policy that allows only this package's style and script, and the given sources.
 
     Args:
         pictures: allowed sources of images.
