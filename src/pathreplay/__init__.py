@@ -1,8 +1,7 @@
 """pathreplay: reverse-mode differentiable light transport on Mitsuba 3.
 
-Importing it registers the plugins for the active variant of Mitsuba and for every later one with automatic
-differentiation. It sets no variant and raises nothing, even where Mitsuba is missing: `pathreplay doctor` then tells
-what to do.
+`import pathreplay` registers the plugins for the active variant of Mitsuba and for each variant that is set later. The
+import sets no variant. It raises nothing, even if Mitsuba is missing; `pathreplay doctor` names the remedy.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ __all__ = [
     "value_and_grad",
 ]
 
-#: Public names that live in rooms which need more time to import than `import pathreplay` should take.
+#: Package of each public name that is imported on first access, because its package takes long to import.
 _LAZY = {
     "Derived": "pathreplay.library",
     "Iteration": "pathreplay.library",
@@ -56,7 +55,7 @@ _LAZY = {
     "step": "pathreplay.library",
     "value_and_grad": "pathreplay.library",
 }
-#: Modules that are called otherwise here.
+#: Full name of each module that has a short name in `pathreplay`.
 _MODULES = {
     "baselines": "pathreplay.baselines",
     "losses": "pathreplay.inverse.losses.pixelwise",
@@ -70,20 +69,20 @@ def _set_up() -> None:
     try:
         os.getcwd()
     except OSError:
-        return  # the folder was removed: Mitsuba would bring Python down at its end; the command says so
+        return  # the current folder was removed: Mitsuba would crash Python at exit; `main` reports the error
     from pathreplay.platform import address_space
 
     if address_space.is_too_small():
-        return  # Mitsuba would hang; commands and functions say so
+        return  # Mitsuba would hang while loading; `address_space.require` reports the error later
     # Before the first import of mitsuba: Dr.Jit looks for libLLVM while it is imported.
     from pathreplay.platform import backend, interrupts, registration
 
     backend.point_drjit()
     try:
-        with interrupts.undisturbed():  # Ctrl-C in the middle of this brings the process down
+        with interrupts.undisturbed():  # Ctrl-C during this import would crash the process
             import mitsuba  # noqa: F401
     except Exception:
-        return  # missing or broken: set_variant and the doctor say so, with the remedy
+        return  # Mitsuba is missing or broken: `set_variant` and the doctor report the remedy
     registration.install()
 
 

@@ -1,7 +1,7 @@
 """Integrators to compare `pathreplay` with: `naive_ad`, `radiative_backprop` and `prb_volume_listing`.
 
-They show the memory, time and noise of other ways to differentiate a path tracer, on the same light-transport step.
-`pathreplay` gives the same gradients for less, or gradients that these miss.
+They use the same light-transport step as `pathreplay`, and show the memory, time and noise of other ways to
+differentiate a path tracer. `pathreplay` computes the same gradients at lower cost, or gradients that the others miss.
 """
 
 from __future__ import annotations

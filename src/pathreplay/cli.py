@@ -1,9 +1,9 @@
 """The command line: each command parses its arguments, calls the package that does the work, and prints the result.
 
-Exit status: 0 for success, 1 for a negative result (a gradient fails its check, or no variant runs on this machine), 2
-for an error that the user has to fix, and 128 plus the signal number if a signal ended the command (130 for Ctrl-C;
-`optimize` writes everything and exits with 0). Heavy modules are imported inside the commands, so that
-`pathreplay --help` responds immediately.
+Exit status 0 means success, 1 a negative result (a gradient fails its check, or no variant runs on this machine), and 2
+an error that the user has to fix. If a signal ends the command, the status is 128 plus the signal number (130 for
+Ctrl-C). After a signal, `optimize` writes its results and exits with 0. Heavy modules are imported inside the commands,
+so that `pathreplay --help` responds immediately.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _UsageError: Any = typer.BadParameter.__base__
 
 
 class _Ended(BaseException):
-    """Carries a KeyboardInterrupt to `main`."""
+    """Wraps a KeyboardInterrupt for `_run`, because typer would handle the KeyboardInterrupt itself."""
 
 
 class _Commands(typer.core.TyperGroup):
-    """Passes a KeyboardInterrupt on to `main`, instead of typer's own message and exit status."""
+    """Converts a KeyboardInterrupt to `_Ended`, because typer would print its own message and exit."""
 
     def invoke(self, ctx: Any) -> object:
         try:
@@ -55,7 +55,7 @@ app = typer.Typer(
     name="pathreplay",
     cls=_Commands,
     help="Differentiable light transport on Mitsuba 3: check gradients, recover scenes from images.",
-    rich_markup_mode=None,  # Typer's panels show a flag as if it took a value: "--quiet <bool>"
+    rich_markup_mode=None,  # typer's panels would show a flag as if it took a value: "--quiet <bool>"
     pretty_exceptions_enable=False,
 )
 
@@ -95,7 +95,7 @@ def doctor(
 
         typer.echo(examine_gpu(variant, output, tell=typer.echo))
         return
-    with interrupts.undisturbed():  # as in `optimize`
+    with interrupts.undisturbed():  # signals must not interrupt imports; see `optimize`
         from pathreplay.doctor import examine
 
     with Console(stderr=True).status("Trying every libLLVM and every variant ..."):
@@ -134,7 +134,7 @@ def check(
     json: Annotated[Path | None, typer.Option(help="Also write results and samples to this JSON file.")] = None,
 ) -> None:
     """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if a check fails."""
-    with interrupts.undisturbed():  # as in `optimize`
+    with interrupts.undisturbed():  # signals must not interrupt imports; see `optimize`
         from pathreplay.platform import backend
         from pathreplay.platform.atomic_files import require_writable
         from pathreplay.scenes.loading import load_scene_for
@@ -238,7 +238,7 @@ def render(
     quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
 ) -> None:
     """Render a scene with any integrator to one file, which is written atomically."""
-    with interrupts.undisturbed():  # as in `optimize`
+    with interrupts.undisturbed():  # signals must not interrupt imports; see `optimize`
         from pathreplay.output.render import RenderOptions, render_to_file
         from pathreplay.platform import backend
 
@@ -255,7 +255,7 @@ def export(
     ] = None,
 ) -> None:
     """Export what a run recovered: textures, volumes, meshes, cameras, and the scene as Mitsuba XML."""
-    with interrupts.undisturbed():  # as in `optimize`
+    with interrupts.undisturbed():  # signals must not interrupt imports; see `optimize`
         from pathreplay.output.export import export_run
 
     typer.echo(export_run(run, output))
@@ -282,8 +282,8 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 _HAS_BENCHMARKS = (_CHECKOUT / "benchmarks" / "__main__.py").is_file()
 
 
-# The options are those of `python -m benchmarks`, which prints its own help. It runs in the current folder, so that
-# relative paths resolve as usual. The wheel contains no benchmarks; there `pathreplay --help` omits the command.
+# `python -m benchmarks` parses the options and prints its own help. It runs in the current folder, so that relative
+# paths resolve as usual. The wheel contains no benchmarks, and its `pathreplay --help` omits the command.
 @app.command(
     short_help="Measure time, memory, noise and correctness.",
     hidden=not _HAS_BENCHMARKS,
@@ -307,7 +307,7 @@ def _require_text_and_folder(arguments: list[str]) -> None:
     try:
         for argument in arguments:
             argument.encode()
-    except UnicodeEncodeError:  # surrogates for bytes that are not UTF-8, which reports and JSON cannot contain
+    except UnicodeEncodeError:  # bytes that are not UTF-8 became surrogates, which reports and JSON cannot contain
         raise PathreplayError(f"argument '{argument}' is not UTF-8; rename the file or folder") from None
     try:
         os.getcwd()
@@ -316,7 +316,7 @@ def _require_text_and_folder(arguments: list[str]) -> None:
 
 
 def _fail(message: str) -> NoReturn:
-    # One line on plain stderr: neither markup nor wrapping may alter a path or a parameter key.
+    # Print plain text without wrapping: markup and line breaks could alter a path or a parameter key.
     with contextlib.suppress(OSError):  # stderr may be closed; the exit status still reports the error
         print("pathreplay: error: " + plain_line(message), file=sys.stderr)
     raise SystemExit(2)
@@ -333,9 +333,10 @@ def main() -> None:
 
 
 def _flush_streams() -> str:
-    """Flush stdout and stderr while an error can still be reported; at exit, Python would only return status 120.
+    """Flush stdout and stderr, and discard output that cannot be written.
 
-    Returns why stdout could not be written, or "". Output that cannot be written is discarded.
+    Returns why stdout could not be written, or "". Without this call, Python would flush at exit and report a failure
+    only by exit status 120.
     """
     problem = ""
     for stream in filter(None, (sys.stdout, sys.stderr)):  # a stream that was closed at the start is None

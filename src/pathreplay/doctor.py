@@ -1,6 +1,6 @@
-"""Says what runs on this machine: versions, the libLLVM files and their verdicts, the variants, and ways out.
+"""Tests each libLLVM and each Mitsuba variant on this machine, and names remedies for failures.
 
-Everything is tried in processes of its own, since a libLLVM that does not fit kills the one it is loaded into.
+Each test runs in a separate process, because an incompatible libLLVM kills the process that loads it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ from pathreplay.platform.llvm import ENVIRONMENT_VARIABLE, LlvmLibrary
 
 @dataclass(frozen=True)
 class VariantVerdict:
-    """Whether a variant of Mitsuba renders and differentiates a small scene here; `message` says why not."""
+    """Whether a variant of Mitsuba renders and differentiates a small scene on this machine.
+
+    `message` is the reason if the test failed, otherwise "".
+    """
 
     name: str
     works: bool
@@ -31,10 +34,10 @@ class VariantVerdict:
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """What was found.
+    """Versions, test results, and remedies.
 
-    `mitsuba` and `drjit` are version numbers, or the reason why they cannot be imported. `remedies` has one line for
-    each failure that can be mended.
+    `mitsuba` and `drjit` are version numbers. If one of them cannot be imported, `mitsuba` is the reason and `drjit` is
+    "unknown". `remedies` has one line for each failure that the user can fix.
     """
 
     mitsuba: str
@@ -49,7 +52,7 @@ class DoctorReport:
         return any(variant.works for variant in self.variants)
 
     def print(self) -> None:
-        """Write the report for people. Lines are never wrapped, so that paths can be copied."""
+        """Print the report to stdout, without wrapping lines, so that paths can be copied."""
         console = Console(highlight=False)
 
         def line(*parts: str | tuple[str, str]) -> None:
@@ -77,7 +80,7 @@ class DoctorReport:
         line(("Verdict", "bold"), f": pathreplay runs here ({usable})" if usable else ": pathreplay does not run here")
 
 
-#: A sphere under a constant light: ray tracing, virtual calls and a gradient that is known to be positive.
+#: Test program: a sphere under a constant emitter needs ray tracing and virtual calls, and its gradient is positive.
 _PROBE = """
 import drjit as dr, mitsuba as mi
 mi.set_variant(task["variant"])
@@ -104,7 +107,7 @@ if not 0.0 < gradient < 100.0:
 
 
 def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[VariantVerdict]:
-    """Try each variant; once one of a back end fails to start, its others are not tried."""
+    """Test the variants in order. If one fails, the later variants of its back end count as failed without a test."""
     environment = os.environ | ({ENVIRONMENT_VARIABLE: library.path} if library else {})
     preload = llvm.unlinked_siblings(library.path) if library else []
     verdicts = []

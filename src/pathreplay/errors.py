@@ -1,16 +1,16 @@
-"""The one exception that users are meant to see: a mistake they can mend, told in one line."""
+"""The exception for errors that users can fix, and the formatting of its one-line message."""
 
 from __future__ import annotations
 
-# Beyond, a message is no line that anyone reads; its two ends name the thing and the remedy.
+# Characters. A longer message is shortened in the middle, because its two ends name the object and the remedy.
 _LONGEST = 1000
 
 
 class PathreplayError(Exception):
-    """A mistake that the user can mend.
+    """An error that the user can fix.
 
-    The message is a single line that names the thing, its value and the remedy (`plain_line`). The command line prints
-    it without a traceback and ends with exit status 2.
+    The message is a single line (`plain_line`) that names the object, its value and the remedy. The command line prints
+    the message without a traceback and ends with exit status 2.
     """
 
     def __init__(self, message: str) -> None:
@@ -18,17 +18,17 @@ class PathreplayError(Exception):
 
 
 def plain_line(text: str) -> str:
-    """``text`` as one line of printable characters: others are escaped, what is too long is cut in the middle."""
+    """Convert text to one line: escape unprintable characters, and shorten a long text in the middle."""
     line = " ".join(text.split())
     line = "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in line)
     return _cut(line, _LONGEST)
 
 
 def shown(value: object, longest: int = 80) -> str:
-    """A value that the user wrote, as it may stand in a message: never long, whatever it is."""
+    """Format a value given by the user for a message, shortened to at most ``longest`` characters."""
     try:
         return _cut(repr(value), longest)
-    except ValueError:  # Python prints no whole number of more than 4300 digits
+    except ValueError:  # Python does not convert integers of more than 4300 digits to text
         return "a number of more than 4300 digits"
     except RecursionError:
         return f"a {type(value).__name__} nested too deep"

@@ -1,6 +1,7 @@
 """Rendering as a function of JAX arrays: images, and gradients of a JAX loss.
 
-Both are callbacks from JAX to Python, so that `jax.jit`, `jax.grad` and `jax.vmap` (sequential) support them.
+Images and gradients are computed by Python callbacks (`jax.pure_callback`), which `jax.jit`, `jax.grad` and `jax.vmap`
+(sequential) support.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ except ImportError:
     raise PathreplayError("JAX is not installed: pip install jax, or 'pathreplay[jax]'") from None
 
 Arrays = Mapping[str, jax.Array]
-Kept = tuple[jax.Array, tuple[jax.Array, ...]]
 """Decoded values by parameter key, in the shapes of `RenderFunction.initial_values`."""
+Kept = tuple[jax.Array, tuple[jax.Array, ...]]
+"""Seed and values, which the forward pass saves for the backward pass."""
 
 
 class RenderFunction(SceneFunction):
-    """Images of a scene as a function of some of its parameters: see `SceneFunction`.
+    """Images of a scene as a function of some of its parameters; see `SceneFunction` for the arguments.
 
     Arrays are float32 and are copied through host memory.
     """
@@ -37,10 +39,10 @@ class RenderFunction(SceneFunction):
         return {}
 
     def initial_values(self) -> dict[str, jax.Array]:
-        """The parameter values of the scene when it was loaded.
+        """Return the parameter values that the scene had when it was loaded.
 
-        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices (3
-        n,), transforms (4, 4).
+        Shapes are (height, width, channels) for textures, (z, y, x, channels) for grids, (3,) for colours, (n,) for n
+        numbers, (3n,) for n vertices, and (4, 4) for transforms.
         """
         return {key: jnp.asarray(value) for key, value in self._start.items()}
 
@@ -49,11 +51,19 @@ class RenderFunction(SceneFunction):
     ) -> jax.Array:
         """Render the image (height, width, channels; linear) of a sensor with these values.
 
-        Textures and grids may be resized. The image is an unbiased estimate. So is the gradient of a loss that is
-        linear in the image, because it uses separate samples. Pass another ``seed`` in every step; it may be an array
-        in compiled functions. The integrator determines what is differentiated; there are no second derivatives. Raises
-        PathreplayError for missing values and wrong shapes. Errors of the integrator are reported by JAX as callback
-        errors.
+        Textures and grids may have another resolution than in the scene. The image is an unbiased estimate. The
+        gradient uses samples that are independent of the image, and is therefore unbiased for losses that are linear or
+        quadratic in the image. The integrator determines what is differentiated; there are no second derivatives.
+
+        Args:
+            values: arrays by parameter key, in the shapes of `initial_values`.
+            sensor: index of the sensor.
+            seed: seed of the samples, which should change in every step; may be an array in compiled functions.
+            spp: samples per pixel; default: ``spp`` of this object.
+
+        Raises:
+            PathreplayError: a value is missing or has the wrong shape. JAX reports errors of the integrator as callback
+                errors.
         """
         self.require({key: tuple(np.shape(value)) for key, value in values.items()})
         arrays = tuple(jnp.asarray(values[key], jnp.float32) for key in self.keys)
@@ -65,7 +75,7 @@ class RenderFunction(SceneFunction):
 
 
 def _function(render: RenderFunction, sensor: int, spp: int) -> Callable[..., jax.Array]:
-    """The image as a function of seed and values, with its vector-Jacobian product."""
+    """Return the image as a differentiable function of seed and values, with its vector-Jacobian product."""
     size = _size(render, sensor)
 
     def picture(seed: np.ndarray, *values: np.ndarray) -> np.ndarray:
@@ -94,7 +104,7 @@ def _function(render: RenderFunction, sensor: int, spp: int) -> Callable[..., ja
 
 
 def _size(render: RenderFunction, sensor: int) -> tuple[int, ...]:
-    """Height, width and channels of a sensor's images, from a rendering with one sample per pixel."""
+    """Return height, width and channels of a sensor's images, from a rendering with one sample per pixel."""
     start = [mi.TensorXf(render._start[key]) for key in render.keys]
     return tuple(render.picture(start, View(sensor, 0, 1)).shape)
 

@@ -23,9 +23,9 @@ Tensors = Mapping[str, torch.Tensor]
 
 
 class RenderFunction(SceneFunction):
-    """Images of a scene as a function of some of its parameters: see `SceneFunction`.
+    """Images of a scene as a function of some of its parameters; see `SceneFunction` for the arguments.
 
-    Tensors are float32 on ``device``: the CPU, or the GPU in CUDA variants. Other tensors are converted.
+    Tensors are float32 on ``device``: the GPU in CUDA variants, otherwise the CPU. Other tensors are converted.
     """
 
     @cached_property
@@ -34,20 +34,28 @@ class RenderFunction(SceneFunction):
         return torch.device("cuda" if backend_of(mi.variant()) == "cuda" else "cpu")
 
     def initial_values(self) -> dict[str, torch.Tensor]:
-        """The parameter values of the scene when it was loaded.
+        """Return the parameter values that the scene had when it was loaded.
 
-        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices (3
-        n,), transforms (4, 4).
+        Shapes are (height, width, channels) for textures, (z, y, x, channels) for grids, (3,) for colours, (n,) for n
+        numbers, (3n,) for n vertices, and (4, 4) for transforms.
         """
         return {key: torch.tensor(value, device=self.device) for key, value in self._start.items()}
 
     def __call__(self, values: Tensors, sensor: int = 0, *, seed: int = 0, spp: int | None = None) -> torch.Tensor:
         """Render the image (height, width, channels; linear) of a sensor with these values.
 
-        Textures and grids may be resized. The image is an unbiased estimate. So is the gradient of a loss that is
-        linear in the image, because it uses separate samples; pass another ``seed`` in every step. The integrator
-        determines what is differentiated. Raises PathreplayError for missing values, wrong shapes, and operations that
-        the integrator does not support.
+        Textures and grids may have another resolution than in the scene. The image is an unbiased estimate. The
+        gradient uses samples that are independent of the image, and is therefore unbiased for losses that are linear or
+        quadratic in the image. The integrator determines what is differentiated.
+
+        Args:
+            values: tensors by parameter key, in the shapes of `initial_values`.
+            sensor: index of the sensor.
+            seed: seed of the samples, which should change in every step.
+            spp: samples per pixel; default: ``spp`` of this object.
+
+        Raises:
+            PathreplayError: a value is missing or has the wrong shape, or the integrator does not support an operation.
         """
         self.require({key: tuple(value.shape) for key, value in values.items()})
         tensors = [values[key].to(self.device, torch.float32) for key in self.keys]
@@ -77,6 +85,6 @@ def _to_drjit(tensors: tuple[torch.Tensor, ...]) -> list[mi.TensorXf]:
 
 
 def _to_torch(tensor: dr.ArrayBase, device: torch.device) -> torch.Tensor:
-    """A copy in memory that PyTorch owns, so that Dr.Jit cannot reuse it."""
+    """Copy a tensor to memory that PyTorch owns, so that Dr.Jit cannot reuse this memory."""
     result: torch.Tensor = tensor.torch()
     return result.to(device).clone()

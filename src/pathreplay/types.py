@@ -1,4 +1,4 @@
-"""Names for tables whose values are known only when they are read."""
+"""Type aliases for dictionaries whose values have types that are known only at run time."""
 
 from __future__ import annotations
 
@@ -8,4 +8,4 @@ Json = dict[str, Any]
 """A table of a JSON, TOML or YAML file, or of a schema."""
 
 SceneDict = dict[str, Any]
-"""A scene or a plugin, as `mi.load_dict` takes it."""
+"""The description of a scene or a plugin for `mi.load_dict`."""

@@ -1,1 +1,1 @@
-"""Evaluates shards by Ray actors, on this machine or on a cluster."""
+"""Evaluates shards (parts of an iteration) in Ray actors, on this machine or on a cluster."""

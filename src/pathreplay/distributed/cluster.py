@@ -1,8 +1,8 @@
-"""Connects a job to Ray: a private cluster on this machine that nobody else can reach, or a cluster at an address.
+"""Connects a job to Ray: to a private cluster on this machine, or to the cluster at an address.
 
-A private cluster listens on loopback only, requires a secret token from every client, and keeps its sockets in a folder
-that only this user can enter. By default Ray would listen on every interface. A cluster at an address must have
-authentication enabled, because requests and answers are unpickled.
+A private cluster listens on loopback only, whereas Ray by default listens on every interface. It requires a secret
+token from every client, and keeps its sockets in a folder that only this user can enter. A cluster at an address must
+have authentication enabled, because Ray unpickles requests and answers.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from pathreplay.inverse.config.executor_options import RayOptions
 from pathreplay.platform.interrupts import undisturbed
 
 OLDEST = (2, 60)
-"""First version whose token authentication covers clusters that are started by a program."""
+"""First version of Ray whose token authentication covers clusters that a program starts."""
 
-# Ray uses loopback addresses when this is off; the switch exists for the firewalls of other systems.
+# If this variable is off, Ray uses loopback addresses. Ray has the variable for systems whose firewalls block clusters.
 _MANY_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _MODE, _TOKEN, _ADDRESS = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"
 _LONGEST_FOLDER = 20
 _SECRET = secrets.token_hex(32)
-"""Token of all private clusters of this process; Ray reads it only once."""
+"""Token of all private clusters of this process. There is only one, because Ray reads the token only once."""
 
 _KNOCK_S = 5.0
-"""Seconds within which the head of a cluster must accept a connection."""
+"""Seconds within which the head node of a cluster must accept a connection."""
 
 _VITAL = ("gcs_server", "raylet")
 
@@ -51,13 +51,13 @@ class Cluster:
 
     ray: ModuleType
     own: bool
-    """Whether it is private to this run."""
+    """Whether the cluster is private to this run."""
     processes: list[psutil.Process] = field(default_factory=list)
-    """Processes of a private cluster that must run for any request to be answered."""
+    """Processes of a private cluster without which Ray answers no request."""
     _checked: float = -1e9
 
     def is_shared(self) -> bool:
-        """Whether the cluster also serves others and still responds."""
+        """Return whether the cluster also serves other programs, and still responds."""
         return not self.own and self._answers()
 
     def require_processes(self) -> None:
@@ -67,9 +67,9 @@ class Cluster:
                 raise _lost(f"{name} has exited")
 
     def require(self, pause: float = 0.0) -> None:
-        """Raise PathreplayError if a process has exited, or if the head does not respond.
+        """Raise PathreplayError if one of the `processes` has exited, or if the head node does not respond.
 
-        The head is contacted at most once every ``pause`` seconds.
+        The head node is contacted at most once every ``pause`` seconds.
         """
         self.require_processes()
         if time.monotonic() - self._checked >= pause:
@@ -101,8 +101,8 @@ def _runs(process: psutil.Process) -> bool:
 
 def load_ray() -> ModuleType:
     """Import Ray. Raises PathreplayError if it is not installed or too old."""
-    os.environ.setdefault(_MODE, "token")  # Ray reads it on import
-    # Keep Ray from hiding devices from actors without a GPU; Ray warns if this is not set.
+    os.environ.setdefault(_MODE, "token")  # Ray reads the variable while it is imported
+    # Keep Ray from hiding devices from actors that reserve no GPU. Ray warns if the variable is not set.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         import ray
@@ -118,13 +118,17 @@ def load_ray() -> ModuleType:
 
 @contextmanager
 def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
-    """Connect to the cluster of the options within this block.
+    """Connect to a Ray cluster within this block.
 
-    An existing connection of the caller is used and left open.
+    If this process is already connected, the existing connection is used and left open. Otherwise the options or the
+    environment may name an address. Without an address, a private cluster is started.
 
     Args:
         options: the job's ``ray`` table.
-        cores: CPUs of a private cluster, which is started if the options and the environment name no address.
+        cores: CPUs of a private cluster.
+
+    Yields:
+        The cluster.
 
     Raises:
         PathreplayError: Ray is missing, cannot start, cannot be reached, or has no authentication.
@@ -137,7 +141,7 @@ def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
     address = options.address or os.environ.get(_ADDRESS)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_silent(ray))
-        with undisturbed():  # Ray installs signal handlers of its own
+        with undisturbed():  # Ray installs its own signal handlers
             if address is None:
                 cluster = _start(ray, stack, cores)
             else:
@@ -148,13 +152,13 @@ def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
 
 
 def _start(ray: ModuleType, stack: contextlib.ExitStack, cores: int) -> Cluster:
-    """Start a private cluster."""
+    """Start a private cluster, which ends with ``stack``. Raises PathreplayError if Ray cannot start safely."""
     temporary = tempfile.gettempdir()
-    # Only this user may enter the folder; Ray's default is open to all users. Socket paths have at most 107 characters.
+    # mkdtemp admits only this user; Ray's default folder admits all. Paths of sockets may have at most 107 characters.
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=temporary if len(temporary) <= _LONGEST_FOLDER else "/tmp")
     guard = Guard(Path(folder))
     stack.callback(guard.close)
-    before = _sessions()  # process sessions that exist already, and are not to be ended with Ray's
+    before = _sessions()  # existing process sessions, which the guard must not end
     with _private_environment(ray), _own_sessions(ray):
         try:
             ray.init(
@@ -166,7 +170,7 @@ def _start(ray: ModuleType, stack: contextlib.ExitStack, cores: int) -> Cluster:
                 _node_ip_address="127.0.0.1",
                 _temp_dir=str(Path(folder) / "ray"),
             )
-        except Exception as error:  # Ray raises plain exceptions here
+        except Exception as error:  # Ray raises plain `Exception` here
             guard.watch(_sessions() - before)
             with contextlib.suppress(Exception):
                 ray.shutdown()
@@ -185,7 +189,7 @@ def _start(ray: ModuleType, stack: contextlib.ExitStack, cores: int) -> Cluster:
 
 
 def _sessions() -> set[int]:
-    """Session ids of our children, except our own session; see `_own_sessions`."""
+    """Return the ids of the process sessions of our descendants, except our own session; see `_own_sessions`."""
     ids = set()
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(OSError):
@@ -244,17 +248,17 @@ def _require_closed(ray: ModuleType, address: str) -> None:
 
 @contextmanager
 def _private_environment(ray: ModuleType) -> Iterator[None]:
-    """Make Ray start clusters on loopback, with our token and without usage statistics, within this block."""
+    """Make Ray start clusters within this block on loopback, with our token, and without usage statistics."""
     settings = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
-    # Ray ends this process when the head has been silent for so many seconds; `Cluster.require` notices earlier.
+    # Ray would end this process if the head node is silent for this time (seconds); `Cluster.require` raises before.
     settings["RAY_gcs_rpc_server_reconnect_timeout_s"] = str(10**6)
-    settings["RAY_worker_niceness"] = "0"  # actors do the work of the run: same priority as this process
+    settings["RAY_worker_niceness"] = "0"  # actors do the work of the run, and get the priority of this process
     before = {name: os.environ.get(name) for name in settings}
     constants = ray._private.ray_constants
     many = constants.ENABLE_RAY_CLUSTER
     os.environ.update(settings)
     constants.ENABLE_RAY_CLUSTER = False
-    ray._raylet.Config.initialize("")  # both values may have been read before
+    ray._raylet.Config.initialize("")  # make Ray read the settings again, and the token below
     ray._raylet.AuthenticationTokenLoader.instance().reset_cache()
     try:
         yield
@@ -268,10 +272,11 @@ def _private_environment(ray: ModuleType) -> Iterator[None]:
 
 @contextmanager
 def _own_sessions(ray: ModuleType) -> Iterator[None]:
-    """Start Ray's processes in sessions of their own within this block, where the kernel still ends them with us.
+    """Start Ray's processes in separate process sessions within this block (only on Linux).
 
-    A terminal or a scheduler sends its signals to all processes of a job. This process then finishes the iteration and
-    writes everything, for which it needs its actors.
+    A terminal or a batch scheduler signals all processes of a command. After a signal, this process finishes the
+    iteration and writes its results, for which it needs the actors. The kernel still ends Ray's processes when this
+    process ends.
     """
     services = ray._private.services
     plain = services.ConsolePopen
@@ -290,7 +295,7 @@ def _own_sessions(ray: ModuleType) -> Iterator[None]:
 
 @contextmanager
 def _silent(ray: ModuleType) -> Iterator[None]:
-    """Suppress Ray's messages about its processes within this block; we log a line of our own instead."""
+    """Suppress Ray's messages about its processes within this block, because the run logs its own lines."""
     worker = ray._private.worker
     plain = worker.print_to_stdstream
     worker.print_to_stdstream = lambda *_, **__: None
@@ -301,7 +306,7 @@ def _silent(ray: ModuleType) -> Iterator[None]:
 
 
 def _beyond_loopback() -> list[str]:
-    """Addresses other than loopback at which children of this process listen."""
+    """Return the addresses other than loopback at which descendants of this process listen."""
     addresses = []
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.Error):

@@ -1,8 +1,8 @@
-"""Removes every process and file of a private Ray cluster, however this process ends.
+"""Removes all processes and files of a private Ray cluster, however the run's process ends.
 
-The guard is a process that outlives this one. The kernel ends the processes that we started for Ray when this one ends,
-but not their own children: the agents of a killed raylet would run forever. Ray also ends a process silently when its
-raylet is gone. The guard prints the reason then.
+The guard is a separate process that outlives the run's process. When the run's process ends, the kernel ends the Ray
+processes that were started by it, but not their children: the agents of a killed raylet would run forever. Ray also
+ends the run's process without a message when the raylet is gone. In this case the guard prints the reason.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 
 _PATIENCE_S = 20.0
 
-# The guard reads session ids from the pipe until this process closes it or ends.
+# Program of the guard. It reads session ids from its standard input until the run's process closes the pipe or ends.
 _GUARD = """
 import os, shutil, signal, sys, time
 for name in ("SIGINT", "SIGTERM", "SIGHUP"):
@@ -52,7 +52,7 @@ shutil.rmtree(sys.argv[1], ignore_errors=True)
 
 
 class Guard:
-    """Kills the remaining processes of the watched sessions and removes ``folder``, at `close` or when we end."""
+    """Starts a guard, which ends the watched sessions and removes ``folder`` at `close` or when this process ends."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -63,13 +63,13 @@ class Guard:
         )  # fmt: skip
 
     def watch(self, sessions: Iterable[int]) -> None:
-        """Add sessions whose processes belong to Ray."""
+        """Add process sessions, by id, that belong to Ray."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             print(*sessions, file=self._process.stdin, flush=True)
 
     def close(self) -> None:
-        """Clean up now, and wait until it is done."""
+        """End the sessions and remove the folder now, and wait until this is done."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             print("done", file=self._process.stdin)

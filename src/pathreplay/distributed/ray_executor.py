@@ -1,8 +1,8 @@
-"""Evaluates shards by Ray actors that hold scene and kernels, on this machine or on a cluster, with the same bits.
+"""Evaluates shards in Ray actors, on this machine or on a cluster, with the same bits as in a single process.
 
-Large values are sent once per step. `Scheduler` decides which actor computes which shard. The choice has no effect on
-the result: an evaluation is a function of the values, the shard and the learned state, and evaluations are summed in
-shard order.
+Each actor keeps the scene and the compiled kernels. Large values are sent once per step. `Scheduler` decides which
+actor computes which shard. This choice has no effect on the result: an evaluation is a function of the values, the
+shard and the learned state, and evaluations are summed in shard order.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from pathreplay.inverse.problem.problem import Problem
 from pathreplay.scenes.descriptions import one_line
 
 THREADS = 4
-"""Maximum default number of cores per actor: Python traces the kernels on a single core."""
+"""Largest default number of threads per actor. More threads help little: Python traces the kernels in one thread."""
 
 SMALL = 2**16
-"""Arrays of up to so many bytes are sent with each request: this is faster than fetching them from the object store."""
+"""Bytes. Smaller arrays are sent with each request, which is faster than fetching them from the object store."""
 
 SOON_S = 60.0
-"""Seconds without any ready actor before this is logged: loading Mitsuba and a scene takes a while."""
+"""Seconds after which a line is logged if no actor is ready. Loading Mitsuba and a scene takes some time."""
 
 LOOK_S, AGAIN_S = 0.1, 1.0
-"""Seconds without an answer after which the processes of the cluster, and its head, are checked."""
+"""Seconds without an answer after which the processes of the cluster, and its head node, are checked."""
 
 Reference = Hashable
 """Ray's reference to an answer, or to arrays in its object store."""
@@ -56,7 +56,7 @@ class Counts:
     again: int = 0
     """Shards that were computed again because their actor was lost."""
     twice: int = 0
-    """Late shards that were also given to a second actor."""
+    """Late shards that a second actor was also asked to compute."""
 
     def line(self) -> str:
         return (
@@ -77,19 +77,19 @@ class _Call:
 
 @dataclass
 class WorkerPool:
-    """The actors of a run and their pending requests; shared by the executors of a job and of its baseline."""
+    """The actors of a run and their pending requests, which the executors of the job and of its baseline share."""
 
     cluster: Cluster
     actors: dict[int, Any]
     setup: Reference
-    """Ray's reference to the `WorkerInit`."""
+    """Ray's reference to the `WorkerInit` of the actors."""
     retries: int
     tell: Tell
     status: Tell = lambda text: None
     """Receives the progress of the current step."""
     counts: Counts = field(default_factory=Counts)
     schedulers: list[Scheduler] = field(default_factory=list)
-    """One per executor."""
+    """The scheduler of each executor."""
     calls: dict[Reference, _Call] = field(default_factory=dict)
     """Pending requests by Ray's reference to the answer."""
     ready: dict[int, Ready] = field(default_factory=dict)
@@ -104,28 +104,28 @@ class WorkerPool:
             self._initialize(number)
 
     def idle(self) -> list[int]:
-        """Actors that are ready and have no pending request."""
+        """Return the actors that are ready and have no pending request."""
         busy = {call.actor for call in self.calls.values()}
         return [number for number in self.ready if number not in busy]
 
     def ask(self, number: int, call: _Call, *request: object) -> None:
-        """Have an actor evaluate shards."""
+        """Send a request to evaluate shards to an actor."""
         self.calls[self.actors[number].evaluate.options(max_task_retries=0).remote(*request)] = call
 
     def sent(self, arrays: Arrays) -> Arrays | Reference:
-        """Arrays as request arguments: large ones go into the object store now, from which actors fetch them."""
+        """Return arrays as a request argument: large arrays are put into the object store, and referenced."""
         return arrays if _bytes_of(arrays) < SMALL else self.ray.put(arrays)
 
     def answered(self, patience: float) -> list[tuple[_Call, Reference]]:
-        """Remove and return answered requests, with the references of their answers.
+        """Wait at most ``patience`` seconds for an answer; return answered requests, with references to the answers.
 
-        Waits at most ``patience`` seconds. Raises PathreplayError if the cluster is lost.
+        Answered requests are removed from ``calls``. Raises PathreplayError if the cluster is lost.
         """
         end = time.monotonic() + patience
         ready: list[Reference] = []
         self.cluster.require_processes()
         while not ready:
-            # Do not wait for the transfer: the actor can get its next request while its answer is on the way.
+            # Do not wait for the transfer of an answer: the actor can receive its next request meanwhile.
             timeout = min(LOOK_S, max(0.0, end - time.monotonic()))
             ready, _ = self.ray.wait(list(self.calls), num_returns=1, timeout=timeout, fetch_local=False)
             if time.monotonic() >= end:
@@ -135,12 +135,12 @@ class WorkerPool:
         return [(self.calls.pop(reference), reference) for reference in ready]
 
     def fetch(self, call: _Call, reference: Reference) -> list[Answer] | None:
-        """Answers to the shards of a request; None if the actor was lost, and for requests that build the problem.
+        """Return the answers to the shards of a request; None if the actor was lost, or the request built the problem.
 
-        Raises PathreplayError if no actor is left. Raises what an evaluation raised.
+        Raises PathreplayError if no actor is left. Raises the error of an evaluation that failed.
         """
         try:
-            answer = self.ray.get(reference)  # does not block: it exists, or its actor is lost
+            answer = self.ray.get(reference)  # does not block: the answer exists, or its actor is lost
         except self.ray.exceptions.RayTaskError as error:
             raise _cause(error) from None
         except self.ray.exceptions.RayError as error:
@@ -172,9 +172,12 @@ class WorkerPool:
             )
 
     def _lost(self, call: _Call, error: Exception) -> None:
-        """Initialize a lost actor again, unless Ray has given it up."""
+        """Initialize a lost actor again, or remove it if Ray will not restart it again.
+
+        Raises PathreplayError if no actor is left.
+        """
         number, host = call.actor, getattr(self.ready.pop(call.actor, None), "host", "its machine")
-        if call.step is None:  # all restarts are used up
+        if call.step is None:  # the initialization failed: all restarts are used up
             del self.actors[number]
             if not self.actors:
                 raise PathreplayError(
@@ -184,20 +187,23 @@ class WorkerPool:
             self.log_once(f"ray: actor {number + 1} is permanently lost; {len(self.actors)} are left")
             return
         if any(other.actor == number and other.step is None for other in self.calls.values()):
-            return  # the loss was already noticed at another request
+            return  # another request has already revealed the loss, and the actor is being initialized
         self.counts.restarts += 1
         self.tell(f"ray: actor {number + 1} on {host} was lost and is being restarted; its shards are computed again")
         self._initialize(number)
 
     def log_once(self, line: str) -> None:
-        """Log a line unless it was logged before, since several actors may cause the same line."""
+        """Log a line unless the same line was logged before, because several actors may cause it."""
         if line not in self.logged:
             self.logged.add(line)
             self.tell(line)
 
 
 class RayExecutor:
-    """`Executor` that evaluates shards by Ray actors, with the job's integrator or its ``baseline``'s."""
+    """`Executor` that evaluates shards in Ray actors, with the integrator of the job or of its ``baseline``.
+
+    ``names`` are the names of the views, for error messages.
+    """
 
     def __init__(self, pool: WorkerPool, names: Sequence[str] = (), baseline: bool = False) -> None:
         self.pool, self.names, self.baseline = pool, names, baseline
@@ -207,7 +213,7 @@ class RayExecutor:
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
         """Yield evaluations in shard order; see `Executor`.
 
-        Raises PathreplayError if all actors are permanently lost. Raises what evaluations raise.
+        Raises PathreplayError if all actors are permanently lost, and the errors of evaluations.
         """
         if not shards:
             return
@@ -247,13 +253,13 @@ class RayExecutor:
     def _hand_out(
         self, step: Step, shards: Sequence[Shard], size: int, values: Arrays | Reference, learned: Arrays | Reference
     ) -> None:
-        """Send requests to idle actors. Values, and therefore gradients, have ``size`` bytes."""
+        """Send requests to idle actors. ``size`` is the size of the values, and of the gradients, in bytes."""
         idle = self.pool.idle()
         for number in step.in_turn(idle):
             late = len(step.again)
             first = step.next(number, time.monotonic(), idle)
             if first is None:
-                break  # the other idle actors, possibly many, would hardly get a shard either
+                break  # the other idle actors, which may be many, would hardly get a shard either
             self.pool.counts.twice += len(step.again) - late
             indices = (first, *step.along(number, size, len(self.pool.ready)))
             self.pool.ask(
@@ -261,7 +267,10 @@ class RayExecutor:
             )
 
     def _lost(self, call: _Call, step: Step, shards: Sequence[Shard], losses: dict[int, int]) -> None:
-        """Reschedule the shards of a request whose actor was lost; the request may belong to an earlier step."""
+        """Reschedule the shards of a request whose actor was lost. The request may belong to an earlier step.
+
+        Raises PathreplayError if a shard of this step was lost too often.
+        """
         assert call.step is not None
         for scheduler in self.pool.schedulers:
             scheduler.forget(call.actor)
@@ -279,7 +288,7 @@ class RayExecutor:
                 )
 
     def _accept(self, answer: Answer) -> Evaluation:
-        """Evaluation of the first answer to a shard; its warnings are logged once."""
+        """Return the evaluation in the first answer to a shard, and log each warning once."""
         self.pool.counts.shards += 1
         for line in answer.warnings:
             if line not in self.pool.logged:
@@ -297,7 +306,7 @@ def _bytes_of(arrays: Arrays) -> int:
 
 
 def _cause(error: Any) -> BaseException:
-    """Exception of an evaluation, as a local evaluation would have raised it."""
+    """Return the exception that an evaluation has raised in an actor."""
     cause = error.cause
     return cause if isinstance(cause, BaseException) else PathreplayError(f"ray: {one_line(error)}")
 
@@ -310,9 +319,10 @@ def require_executor(config: Config) -> None:
 
 @contextmanager
 def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Tell) -> Iterator[WorkerPool | None]:
-    """Start the actors of a job, which end with the block; None if the job runs in this process.
+    """Start the actors of a job, which end with this block, and yield them; None if the job runs in this process.
 
-    ``tell`` receives log lines, ``status`` the progress within a step. Raises PathreplayError.
+    ``tell`` receives log lines, and ``status`` the progress within a step. Raises PathreplayError if the cluster cannot
+    be used or is too small.
     """
     if config.executor != "ray":
         yield None
@@ -334,7 +344,7 @@ def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Te
             yield pool
             tell(f"ray: {pool.counts.line()}")
         finally:
-            if cluster.is_shared():  # a private cluster ends together with its actors
+            if cluster.is_shared():  # the end of a private cluster also ends its actors
                 for actor in pool.actors.values():
                     ray.kill(actor)
 
@@ -344,7 +354,7 @@ def _needs(threads: int) -> dict[str, float]:
 
 
 def _count(ray: ModuleType, config: Config, threads: int, problem: Problem) -> int:
-    """Number of actors to start. Raises PathreplayError if the cluster has too few cores or GPUs."""
+    """Return the number of actors to start. Raises PathreplayError if the cluster has too few cores or GPUs."""
     needs = {"CPU": threads, "GPU": _needs(threads)["num_gpus"]}
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     room = sum(min(int(node.get(name, 0) // n) for name, n in needs.items() if n) for node in nodes)

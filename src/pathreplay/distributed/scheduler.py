@@ -1,9 +1,10 @@
-"""Assigns the shards of a step to actors by measured durations, while results come in and without effect on them.
+"""Assigns the shards of a step to actors, based on measured durations. Results do not depend on the assignment.
 
-Every actor keeps the views that it had before, because it holds their kernels. An actor with nothing left takes a shard
-from the actor with the most remaining work, so that all actors end at about the same time. When no shard is left to
-start, an idle actor also computes a shard that takes much longer than expected, and the first result counts. Short
-shards share one request, because each request has a fixed cost.
+A step is an iteration of the optimisation. Each actor evaluates the same views in every step, because it has compiled
+their kernels. An actor that has finished its own shards takes one from the actor with the most remaining work, so that
+all actors finish at about the same time. If no shard is waiting, an idle actor also computes a shard that takes much
+longer than expected, and the first result counts. Short shards share one request, because each request has a fixed
+cost.
 """
 
 from __future__ import annotations
@@ -14,72 +15,78 @@ from dataclasses import dataclass, field
 from pathreplay.inverse.objective.evaluate import Shard
 
 Actor = int
-"""Number of an actor; a restarted actor keeps it."""
+"""Number of an actor, which stays the same if the actor is restarted."""
 
 LATE = 2.0
-"""A request is a straggler after LATE times the expected cold-start duration of its first shard.
+"""A request is late after LATE times its expected duration, assuming that its first shard has no kernels yet.
 
-This exceeds the timing noise of a shared machine, and a second actor that starts the shard can still be first.
+The factor exceeds the timing noise of a shared machine, and a second actor that starts the shard can still be first.
 """
 
 WARM = 2
-"""Evaluations of a view after which an actor holds its kernels: the first is traced, the second is recorded."""
+"""Number of evaluations after which an actor has the kernels of a view: the first traces, the second records them."""
 
 SHORTEST_S, LONGEST_S = 0.01, 0.1
-"""Range of the duration of a request of several short shards (`benchmarks.schedule --measure` gives a call's cost)."""
+"""Smallest and largest time limit, in seconds, of a request of several short shards.
+
+`benchmarks.schedule --measure` measures the fixed cost of a request.
+"""
 
 AHEAD = 0.7
-"""Maximum fraction of an actor's remaining work in one request; other actors can still take the rest."""
+"""Largest fraction of an actor's remaining work in one request; other actors can still take the rest."""
 
 TOGETHER = 2**26
-"""Maximum bytes of gradients per request of several shards."""
+"""Largest number of bytes of gradients in a request of several shards."""
 
 SMOOTHING = 0.5
-"""Weight of the previous estimate when the duration of a view is measured again."""
+"""Weight of the previous estimate when a new duration of a shard kind is averaged in."""
 
 Kind = tuple[tuple[int, ...], int, int]
-"""Key of shards of equal duration: views, samples, stage."""
+"""Kind of a shard: views, samples and stage. Shards of the same kind have the same expected duration."""
 
 
 def kind_of(shard: Shard) -> Kind:
-    """Key of all that determines the duration of a shard: its views, samples and stage."""
+    """Return the kind of a shard: the views, samples and stage, which determine its duration."""
     return shard.views, shard.samples, shard.stage
 
 
 @dataclass
 class Scheduler:
-    """Measurements of shards and actors that are kept from step to step."""
+    """Measurements of shards and actors that are kept from step to step.
+
+    An evaluation is warm if the actor has the kernels of the shard, and cold otherwise.
+    """
 
     seconds: dict[Kind, float] = field(default_factory=dict)
-    """Warm duration per shard kind (cold duration until one is known)."""
+    """Warm duration per shard kind; the cold duration until a warm duration is known."""
     warm: set[Kind] = field(default_factory=set)
-    """Kinds whose ``seconds`` are a warm duration."""
+    """Kinds whose duration in ``seconds`` is warm."""
     extra: float = 0.0
-    """Additional seconds of a cold evaluation."""
+    """Difference between a cold and a warm duration, in seconds."""
     owner: dict[Kind, Actor] = field(default_factory=dict)
-    """Actor that evaluated the kind last."""
+    """Actor that last evaluated a shard of the kind."""
     times: dict[tuple[Actor, Kind], int] = field(default_factory=dict)
     """Number of evaluations per actor and kind."""
     waited: dict[Actor, float] = field(default_factory=dict)
-    """Seconds that an actor was idle in earlier steps, because it would have finished later than the owner."""
+    """Seconds of work in earlier steps that an actor left to the owner, because the owner would finish it sooner."""
     refused: dict[Actor, float] = field(default_factory=dict)
-    """The same for the current step."""
+    """Seconds of such work in the current step."""
 
     def begin(self) -> None:
-        """Begin a step."""
+        """Begin a step: add ``refused`` to ``waited``."""
         for actor, seconds in self.refused.items():
             self.waited[actor] = self.waited.get(actor, 0.0) + seconds
         self.refused.clear()
 
     def expected(self, actor: Actor, kind: Kind) -> float | None:
-        """Seconds that the actor is expected to take; None if no shard of this kind was measured."""
+        """Return the seconds that an actor is expected to take for a shard; None if its kind was never measured."""
         known = self.seconds.get(kind)
         if known is None:
             return None
         return known if self.holds(actor, kind) else known + self.extra
 
     def holds(self, actor: Actor, kind: Kind) -> bool:
-        """Whether the actor holds the kernels of such a shard."""
+        """Return whether an actor has the kernels of a shard kind."""
         return self.times.get((actor, kind), 0) >= WARM
 
     def measured(self, actor: Actor, kind: Kind, seconds: float) -> None:
@@ -93,7 +100,7 @@ class Scheduler:
             if kind in self.warm:
                 self._learn(seconds - known)
         elif kind in self.warm:
-            seconds = min(seconds, LATE * known)  # an outlier must not delay the detection of the next straggler
+            seconds = min(seconds, LATE * known)  # an outlier must not delay the detection of the next late shard
             self.seconds[kind] = SMOOTHING * known + (1 - SMOOTHING) * seconds
         else:
             self._learn(known - seconds)
@@ -104,7 +111,7 @@ class Scheduler:
         self.extra = SMOOTHING * self.extra + (1 - SMOOTHING) * max(0.0, extra)
 
     def forget(self, actor: Actor) -> None:
-        """Drop what is known of an actor that was lost with its kernels."""
+        """Drop the measurements of an actor that was lost with its kernels."""
         self.times = {key: n for key, n in self.times.items() if key[0] != actor}
         self.owner = {kind: other for kind, other in self.owner.items() if other != actor}
         self.waited.pop(actor, None)
@@ -112,42 +119,49 @@ class Scheduler:
 
 @dataclass
 class Request:
-    """Shards that an actor is evaluating and answers together."""
+    """A running request: shards, by index, that an actor evaluates and answers together."""
 
     shards: list[int]
     since: float
+    """Start time."""
     more: float = 0.0
-    """Expected seconds of all shards but the first."""
+    """Expected seconds of all shards except the first."""
 
 
 class Step:
-    """State of the shards of one step: waiting, running or done. Each operation is cheap for any number of shards."""
+    """The shards of one step: each is waiting, running or done. Operations are cheap for any number of shards."""
 
     def __init__(self, scheduler: Scheduler, shards: Sequence[Shard]) -> None:
         self.scheduler = scheduler
         scheduler.begin()
         self.kinds = [kind_of(shard) for shard in shards]
         self.waiting: dict[Actor | None, list[int]] = {}
-        """Waiting shards by owner, or None if unknown, in ascending order of duration; equals in descending order."""
+        """Indices of waiting shards by owner (None: no owner), by ascending duration, and then by descending index."""
         self.left: dict[Actor | None, float] = {}
-        """Expected seconds of an owner's waiting shards: the sum of their ``cost``."""
+        """Expected seconds of all waiting shards of an owner: the sum of their ``cost``."""
         self.cost: dict[int, float] = {}
+        """Expected seconds of a shard that is or was waiting, by index."""
         self.running: dict[Actor, Request] = {}
         self.done: set[int] = set()
         self.again: set[int] = set()
         """Late shards that a second actor has started."""
         self._wait(range(len(shards)))
         self.all = sum(self.left.values())
-        """Expected seconds of all shards, as far as known."""
+        """Expected seconds of all shards; unknown durations count as zero."""
 
     def in_turn(self, idle: Iterable[Actor]) -> list[Actor]:
-        """Sort idle actors by priority: owners of waiting shards first, then those that have waited longest."""
+        """Sort idle actors by priority: owners of waiting shards first, then by descending ``Scheduler.waited``."""
         return sorted(idle, key=lambda actor: (not self.waiting.get(actor), -self.scheduler.waited.get(actor, 0.0)))
 
     def next(self, actor: Actor, now: float, idle: Collection[Actor]) -> int | None:
-        """Start a shard on an idle actor and return its index; None if there is nothing to do for now.
+        """Choose the next shard of an idle actor, mark it as running, and return its index.
 
-        ``idle`` are all idle actors.
+        Returns None if the actor should not start a shard now.
+
+        Args:
+            actor: the idle actor.
+            now: the current time.
+            idle: all idle actors.
         """
         for owner in (actor, None):
             if self.waiting.get(owner):
@@ -158,8 +172,8 @@ class Step:
         most = self._busiest(now)
         if most is not None:
             other, left = most
-            # Leave the shard to its owner if that is faster. Time that the actor has waited in earlier steps counts in
-            # its favour: an actor that joins late would never build any kernels otherwise.
+            # Leave a shard to its owner if the owner finishes it sooner. Work that the actor has left to owners in
+            # earlier steps raises this limit: otherwise an actor that joins late would never compile any kernels.
             worth = left + self.scheduler.waited.get(actor, 0.0)
             for place in reversed(range(len(self.waiting[other]))):
                 if (self.scheduler.expected(actor, self.kinds[self.waiting[other][place]]) or 0.0) < worth:
@@ -174,17 +188,17 @@ class Step:
         return late[1]
 
     def along(self, actor: Actor, size: int, actors: int) -> list[int]:
-        """Add short shards from the actor's own queue to the request that `next` has started; returns their indices.
+        """Add short shards from the actor's own queue to the request that `next` has started; return their indices.
 
-        Their time is limited to a fraction of the actor's remaining work, and to an even share among ``actors``. So
-        requests become shorter towards the end, and all actors end at about the same time. The bytes of a gradient,
-        ``size``, limit their number.
+        The time of a request is limited to a fraction of the actor's remaining work, and to the step's work divided by
+        the number of ``actors``. Requests therefore become shorter towards the end of a step, and all actors finish at
+        about the same time. `TOGETHER` limits the number of shards, whose gradients have ``size`` bytes each.
         """
         waiting, request = self.waiting.get(actor, []), self.running[actor]
         if not self.scheduler.holds(actor, self.kinds[request.shards[0]]):
             return []
         room, first = TOGETHER // max(1, size), self._seconds(actor, request.shards[0])
-        even = self.all / actors * (1 + 1e-6)  # rounding must not cut off the last of equally long shards
+        even = self.all / actors * (1 + 1e-6)  # rounding must not exclude the last of several equally long shards
         limit = min(LONGEST_S, even, max(SHORTEST_S, AHEAD * (first + self.left.get(actor, 0.0))))
         while waiting and len(request.shards) < room and self.scheduler.holds(actor, self.kinds[waiting[-1]]):
             more = request.more + self.cost[waiting[-1]]
@@ -195,16 +209,19 @@ class Step:
         return request.shards[1:]
 
     def _goes_on(self, actor: Actor, idle: Collection[Actor]) -> bool:
-        """Whether the actor will reach its waiting shards: it is not lost, stuck, or busy with an earlier step."""
+        """Return whether an actor will start its waiting shards: it is not lost, late, or busy with an earlier step."""
         return self.again.isdisjoint(self.running[actor].shards) if actor in self.running else actor in idle
 
     def heard(self, index: int, actor: Actor) -> None:
-        """End the actor's request that contains the shard; the actor may then start another."""
+        """Mark the actor's request that contains the shard as answered, so that the actor may start another request."""
         if actor in self.running and index in self.running[actor].shards:
             del self.running[actor]
 
     def finished(self, index: int, actor: Actor, seconds: float) -> bool:
-        """Record a result; returns whether it is the first of the shard. The actor may run its next request already."""
+        """Record a result, and return whether it is the first of this shard.
+
+        The actor may already be evaluating its next request.
+        """
         self.heard(index, actor)
         self.scheduler.measured(actor, self.kinds[index], seconds)
         first = index not in self.done
@@ -212,7 +229,10 @@ class Step:
         return first
 
     def lost(self, index: int, actor: Actor) -> None:
-        """Put the shard of a lost actor back, unless another actor runs it. Its waiting shards become unowned."""
+        """Make the shard of a lost actor wait again, unless it is done or another actor is evaluating it.
+
+        Waiting shards of the lost actor get the current owner of their kind, usually None (see `forget`).
+        """
         self.heard(index, actor)
         self.left.pop(actor, None)
         theirs = self.waiting.pop(actor, [])
@@ -223,7 +243,7 @@ class Step:
         self._wait(theirs)
 
     def patience(self) -> float | None:
-        """Time at which the next running shard becomes late; None if none will."""
+        """Return the time at which the next running shard becomes late; None if no shard can become late."""
         late = self._latest()
         return None if late is None else late[0]
 
@@ -252,7 +272,7 @@ class Step:
         return 0.0 if owner is None else self.scheduler.expected(owner, self.kinds[index]) or 0.0
 
     def _busiest(self, now: float) -> tuple[Actor, float] | None:
-        """Actor with waiting shards that has the most remaining work, and its seconds."""
+        """Return the owner of waiting shards with the most remaining work, and the expected seconds of this work."""
         busiest: tuple[Actor, float] | None = None
         for owner, indices in self.waiting.items():
             if owner is None or not indices:
@@ -266,7 +286,10 @@ class Step:
         return busiest
 
     def _latest(self) -> tuple[float, int] | None:
-        """Time at which the first shard that only one actor runs becomes late, and its index."""
+        """Return the time at which the first running shard becomes late, and its index.
+
+        Shards that a second actor is also evaluating are excluded. Returns None if there is no such shard.
+        """
         late, seconds, extra = [], self.scheduler.seconds, self.scheduler.extra
         for request in self.running.values():
             known = seconds.get(self.kinds[request.shards[0]])

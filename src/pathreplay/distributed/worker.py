@@ -1,4 +1,4 @@
-"""The Ray actor: holds the scene of a job and its compiled kernels, and evaluates shards with them."""
+"""The Ray actor, which keeps the scene of a job and its compiled kernels, and evaluates shards."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from pathreplay.scenes.descriptions import errors_as
 
 @dataclass(frozen=True)
 class WorkerInit:
-    """What an actor needs to build the same problem as the driver process."""
+    """Data from which an actor builds the same problem as the run's own process."""
 
     config: Config
     base: Path
@@ -38,7 +38,7 @@ class WorkerInit:
 
 @dataclass(frozen=True)
 class Ready:
-    """Identifies an actor once its problem is built."""
+    """Answer of an actor that has built its problem: its machine, process and package versions."""
 
     host: str
     process: int
@@ -58,18 +58,18 @@ class Answer:
 
 
 def versions() -> str:
-    """Versions of the packages that must match in the driver and in all actors."""
+    """Return the versions of the packages that must be the same in the run's own process and in all actors."""
     return ", ".join(f"{name} {version(name)}" for name in ("pathreplay", "mitsuba", "drjit", "numpy"))
 
 
 class Log(Protocol):
-    """Holds the lines that Mitsuba has logged."""
+    """A log whose ``lines`` Mitsuba has written."""
 
     lines: list[str]
 
 
 class RayActor:
-    """Evaluates shards of one job. Requests leave no state behind except compiled kernels."""
+    """Evaluates shards of one job. Requests change no state except the compiled kernels."""
 
     def __init__(self) -> None:
         self.problem: Problem | None = None
@@ -78,7 +78,7 @@ class RayActor:
         self.log: Log
 
     def hello(self, setup: WorkerInit) -> Ready:
-        """Build the problem; must be called first. Raises PathreplayError if this machine lacks something it needs."""
+        """Build the problem; must be called first. Raises PathreplayError if this is impossible on this machine."""
         backend.set_variant(setup.variant)
         dr.set_thread_count(setup.threads)
         self.evaluators = {}
@@ -89,7 +89,10 @@ class RayActor:
         return Ready(platform.node(), os.getpid(), versions(), machine)
 
     def evaluate(self, baseline: bool, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Answer] | None:
-        """Evaluate shards with the integrator of the job or its baseline; None if the actor was restarted meanwhile."""
+        """Evaluate shards with the integrator of the job or of its baseline.
+
+        Returns None if the actor was restarted and has no problem yet.
+        """
         return None if self.problem is None else [self._answer(baseline, values, shard, learned) for shard in shards]
 
     def _answer(self, baseline: bool, values: Arrays, shard: Shard, learned: Arrays) -> Answer:
@@ -113,9 +116,9 @@ class RayActor:
 
 
 def _capture_log() -> Log:
-    """Collect Mitsuba's log in memory, since nobody reads the terminal of an actor."""
+    """Collect Mitsuba's warnings in memory, because nobody reads the terminal of an actor."""
 
-    class LogBuffer(mi.Appender):  # defined here, since the base class depends on the variant
+    class LogBuffer(mi.Appender):  # defined here, because the base class depends on the variant
         def __init__(self) -> None:
             super().__init__()
             self.lines: list[str] = []
@@ -139,7 +142,7 @@ def _capture_log() -> Log:
 
 
 def _processor() -> str:
-    """Name of the processor if the system reports one, else the machine type."""
+    """Return the name of the processor if the system reports it, otherwise the machine type."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

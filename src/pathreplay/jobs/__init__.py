@@ -1,4 +1,4 @@
-"""Jobs: an optimization described by a config, from the first check to the report in its run folder."""
+"""Jobs: optimizations that a config describes, from the check of the config to the report in the run folder."""
 
 from __future__ import annotations
 

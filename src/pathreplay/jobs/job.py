@@ -1,4 +1,4 @@
-"""Starts an optimization job for ``pathreplay optimize`` and for Python: as a whole, or iteration by iteration."""
+"""Starts a job for ``pathreplay optimize`` and for Python: `optimize` runs all of it, `iterate` step by step."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def optimize(
 ) -> RunResult:
     """Recover the parameters of a job, and write its run folder.
 
-    The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration, with everything written; a further
-    Ctrl-C aborts it (KeyboardInterrupt). Until the run folder exists, signals keep their previous handlers. A
+    The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration, with all results written. A further
+    Ctrl-C aborts the run (KeyboardInterrupt). Until the run folder exists, signals keep their previous handlers. A
     ``deterministic`` job uses a single thread; the previous number of threads is restored afterwards.
 
     Args:
-        config: path of a TOML or YAML file, or a Config (relative paths in it start at the current folder).
+        config: path of a TOML or YAML file, or a Config, whose relative paths refer to the current folder.
         resume: run folder of an earlier, unfinished run to continue; excludes ``config`` and ``output``.
-        output: run folder to create; the default is the config's ``output``, else ``runs/<name of the config>``. If it
-            exists, a number is appended: an earlier run is never touched.
+        output: run folder to create; default: the config's ``output``, or ``runs/<name of the config>`` without one. If
+            the folder exists, a number is appended: an earlier run is never touched.
         progress: show a progress bar in a notebook or on stderr (periodic lines if stderr is not a terminal).
         define: changes to the config file, each ``KEY=VALUE`` (see docs/optimize.md).
         executor: ``local`` or ``ray``; overrides the config, also for a resumed run.
@@ -44,8 +44,8 @@ def optimize(
         Parameters, errors, history and image metrics of the run; all of it is also in the run folder.
 
     Raises:
-        PathreplayError: something in the job cannot work (raised before the first iteration), the disk is full, or the
-            run folder is in use, damaged, or vanishes.
+        PathreplayError: the job cannot work (raised before the first iteration), the disk is full, or the run folder is
+            in use, is damaged, or disappears.
     """
     try:
         with iterate(
@@ -55,7 +55,7 @@ def optimize(
                 pass
             return session.stop()
     finally:
-        # The scene is part of a reference cycle, and Dr.Jit traces virtual calls through every scene that is alive.
+        # Free the scene, which is part of a reference cycle: Dr.Jit traces virtual calls through every scene in memory.
         gc.collect()
 
 
@@ -68,10 +68,10 @@ def iterate(
     define: Sequence[str] = (),
     executor: str | None = None,
 ) -> Optimization:
-    """Run a job iteration by iteration: iterating over the result yields an `Iteration` after each.
+    """Run a job step by step: iterating over the result yields an `Iteration` after each step.
 
-    Arguments, signals and errors are those of `optimize`. The config is checked immediately, everything else when the
-    first one is requested. See `Optimization` for how it ends.
+    Arguments, the effect of signals, and errors are the same as for `optimize`. The config is checked immediately, and
+    everything else when the first iteration is requested. `Optimization` describes the ways to end the run.
     """
     if executor is not None and executor not in get_args(ExecutorName):
         raise PathreplayError(f"executor is {shown(executor)}; use one of {', '.join(get_args(ExecutorName))}")
@@ -84,7 +84,7 @@ def iterate(
 def _started(
     config: str | Path | Config | None, resume: str | Path | None, output: str | Path | None, changes: tuple[str, ...]
 ) -> tuple[Job, Path, RunFolder | None]:
-    """The job, the path of its run folder, and the folder to resume, if any."""
+    """Return the job, the path of its run folder, and the run folder to resume (None for a new run)."""
     if resume is not None:
         if config is not None or output is not None or changes:
             raise PathreplayError(

@@ -1,4 +1,4 @@
-"""A running job as an iterator, and the ways in which it ends."""
+"""A running job as an iterator that can be stopped or closed."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ from pathreplay.runs.saving import saved_targets
 class Optimization:
     """A running job: iterating over it yields an `Iteration` after each step.
 
-    The scene is loaded when the first iteration is requested. At the end of the loop everything is written, and
-    ``result`` is set. Leaving the loop early, or `close`, which ends a ``with`` block, leaves a checkpoint to resume
-    from. `stop` ends the run with everything written. For signals see `pathreplay.optimize`.
+    The scene is loaded when the first iteration is requested. At the end of the loop, all results are written and
+    ``result`` is set. `stop` ends the run early and also writes all results. `close` ends the run with only a
+    checkpoint to resume from; leaving the loop early or a ``with`` block has the same effect. `pathreplay.optimize`
+    describes the effect of signals.
     """
 
     def __init__(self, job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> None:
@@ -42,7 +43,7 @@ class Optimization:
         return self
 
     def __next__(self) -> Iteration:
-        self._resumed = None  # the generator releases it from now on
+        self._resumed = None  # from now on, the generator releases the lock of the resumed folder
         try:
             return next(self._iterations)
         except StopIteration as end:
@@ -56,15 +57,15 @@ class Optimization:
         self.close()
 
     def close(self) -> None:
-        """End the run with a checkpoint only."""
+        """End the run with a checkpoint, but without results."""
         self._iterations.close()
         if self._resumed is not None:  # the generator has not started
             self._resumed.lock.close()
 
     def stop(self) -> RunResult:
-        """End the run with everything written, after at least one iteration.
+        """End the run after at least one iteration, and write all results.
 
-        Raises PathreplayError as the loop does, and if the run was closed before.
+        Raises PathreplayError for the errors of the loop, and if the run was closed before.
         """
         self._stop.by = self._stop.by or "stop()"
         for _ in self:
@@ -77,7 +78,7 @@ class Optimization:
 def _iterations(
     job: Job, output: Path, home: Path, resumed: RunFolder | None, progress: bool, stop: Stop
 ) -> Generator[Iteration, None, RunResult]:
-    """Run a job; yields its iterations and returns the result. A relative ``output`` refers to ``home``."""
+    """Run a job: yield its iterations and return the result. A relative ``output`` refers to ``home``."""
     config = job.config
     with ExitStack() as stack:
         if resumed is not None:

@@ -1,4 +1,4 @@
-"""The library: inverse problems of objects and arrays in memory, their gradients, and their minimisation."""
+"""The library: inverse problems of scenes and images in memory, their gradients, and their minimisation."""
 
 from pathreplay.library.descriptions import Derived, Parameter, View
 from pathreplay.library.gradients import value_and_grad

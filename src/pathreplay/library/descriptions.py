@@ -1,4 +1,4 @@
-"""Descriptions of parameters, derived parameters and views, and their translation to the tables of a job."""
+"""Descriptions of parameters, derived parameters and views, and their conversion to the tables of a job."""
 
 from __future__ import annotations
 
@@ -16,29 +16,30 @@ from pathreplay.types import Json
 
 @dataclass(frozen=True)
 class Parameter:
-    """Options of one scene parameter, or of several by a glob; fields have the names of the keys of jobs.
+    """Options of one scene parameter, or of all parameters that match a glob.
 
-    Values are decoded reflectances and radiances, in the shape that `mi.traverse` shows.
+    The fields have the same names as the keys in a job. Values are decoded reflectances and radiances, in the shape
+    that `mi.traverse` shows.
 
     Args:
-        initial: a number, a colour, an array in the parameter's shape, or an image or volume file; for a pose a
-            displacement ``{"translation": [x, y, z], "rotation": [rx, ry, rz]}`` (scene units, degrees). Default: the
-            value in the scene.
+        initial: initial value: a number, a colour, an array in the parameter's shape, or an image or volume file. A
+            pose has a displacement ``{"translation": [x, y, z], "rotation": [rx, ry, rz]}`` (scene units, degrees).
+            Default: the value in the scene.
         bounds: lower and upper bound, enforced by projection after each step.
-        learning_rate: approximate length of a step of Adam. Default: that of the problem.
-        parameterization: ``"log"``, ``"softplus"`` or ``"logit"``: steps are taken in this function of the value.
+        learning_rate: learning rate; with Adam, approximately the length of a step. Default: that of the problem.
+        parameterization: ``"log"``, ``"softplus"`` or ``"logit"``: function of the value in which steps are taken.
         resolutions: sizes of a grid, coarse to fine.
         refine_at: iterations at which the grid is refined.
-        pose: ``"translation"``, ``"rotation"`` or ``"rigid"`` motion of a ``to_world`` or of ``vertex_positions``.
+        pose: motion of a ``to_world`` or of ``vertex_positions``: ``"translation"``, ``"rotation"`` or ``"rigid"``.
         pivot: centre of the rotation of a pose.
         rotation_learning_rate: learning rate of the rotation of a pose, in degrees.
-        error_scale: length with which position errors of a pose are compared.
+        error_scale: length relative to which position errors of a pose are reported.
         large_steps_lambda: λ of Large Steps (Nicolet et al. 2021), for ``vertex_positions``.
         total_variation: weight of the total variation.
         l2_to_initial: weight of the mean squared difference from the initial value.
         laplacian_weight: weight of the mean squared Laplacian of vertices.
-        regularizer: function of the values (a tensor) that returns one number, which is added to the loss.
-        shape: shape of a parameter that is not part of the scene, from which others are `Derived`.
+        regularizer: function of the values (a tensor); it returns one number, which is added to the loss.
+        shape: shape of a parameter that is not part of the scene; scene parameters are `Derived` from it.
     """
 
     initial: object = None
@@ -61,7 +62,11 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Derived:
-    """A scene parameter computed from parameters: ``function(value in the scene, *values of the parameters in of)``."""
+    """A scene parameter that a function computes from other parameters.
+
+    Its value is ``function(initial, *inputs)``, where ``initial`` is the value in the scene and ``inputs`` are the
+    values of the parameters named in ``of``.
+    """
 
     function: Callable[..., object] | str
     of: Sequence[str]
@@ -98,14 +103,17 @@ def require_kinds(wanted: Mapping[str, Parameter | None], views: Sequence[View],
 
 
 def by_key(parameters: Mapping[str, Parameter | None] | Sequence[str] | str) -> dict[str, Parameter | None]:
-    """Return parameters by key or glob; names alone stand for parameters without options."""
+    """Return the options of parameters by key or glob; a key that is given without options has None."""
     if isinstance(parameters, Mapping):
         return dict(parameters)
     return dict.fromkeys([parameters] if isinstance(parameters, str) else parameters)
 
 
 class Objects:
-    """Functions and arrays of a problem, by the names that represent them in the tables of a job."""
+    """Functions and arrays of a problem, by the names that represent them in the tables of a job.
+
+    ``starts`` are initial values by parameter key.
+    """
 
     def __init__(self) -> None:
         self.functions: dict[str, Callable[..., object]] = {}
@@ -124,7 +132,7 @@ class Objects:
         return name
 
     def tables(self, wanted: Mapping[str, Parameter | None]) -> list[Json]:
-        """Translate parameters to tables. Raises PathreplayError if the initial value of a pose is an array."""
+        """Convert parameters to tables. Raises PathreplayError if the initial value of a pose is an array."""
         return [self._table(key, entry or Parameter()) for key, entry in wanted.items()]
 
     def _table(self, key: str, entry: Parameter) -> Json:
@@ -144,7 +152,7 @@ class Objects:
         return {name: _plain(value) for name, value in table.items() if value is not None}
 
     def made(self, derived: Mapping[str, Derived]) -> list[Json]:
-        """Translate derived parameters to tables."""
+        """Convert derived parameters to tables."""
         return [
             {"key": key, "function": self.named(each.function), "of": list(each.of)} for key, each in derived.items()
         ]

@@ -1,4 +1,4 @@
-"""A run with a folder: checkpoints and live page during the run, report at the end."""
+"""Writes the folder of a run: checkpoints and the live page during the run, and the report at its end."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from pathreplay.runs.saving import Saving, first_files, go_on, saved_targets
 
 
 class FolderRun:
-    """Writer of a run folder; ``observe`` receives all events of the run.
+    """Writes a run folder; ``observe`` receives all events of the run.
 
     Args:
-        job: the job; its config is replaced by that of the problem.
+        job: the job; the config of the problem replaces its config.
         problem: the problem.
-        run: the run at its start. If a folder is resumed, it is restored from the checkpoint.
-        stop: set by the stop button of the live page.
+        run: the run before its first iteration. If a folder is resumed, the run is restored from its checkpoint.
+        stop: request to stop the run, which the stop button of the live page sets.
         output: the new folder; a number is appended if it exists.
         home: folder to which a relative ``output`` refers.
-        resumed: the folder to resume; default: create a new one.
+        resumed: the folder to resume; None creates a new folder.
 
     Raises:
         PathreplayError: the folder cannot be created or is damaged, the run has ended, or the initial loss is not
@@ -54,20 +54,23 @@ class FolderRun:
 
     @property
     def remedy(self) -> str:
-        """Return the message for an aborted run."""
+        """Return the message for an aborted run, with the command that resumes it."""
         return f"aborted; go on from the last checkpoint with: {self.folder.resume_command()}"
 
     def observe(self, event: Event) -> None:
-        """Write what is due. Raises PathreplayError if the folder has disappeared or cannot be written."""
+        """Write the checkpoint, page and previews that are due after an event.
+
+        Raises PathreplayError if the folder has disappeared or cannot be written.
+        """
         self._saving.observe(event)
         with self._problem.computing():
             self.previews.observe(event)
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Save a checkpoint if the iterations in this block end early, by an error or by closing the generator.
+        """Save a checkpoint if an error or closing the generator ends the iterations in this block early.
 
-        A new folder is removed if the first iteration fails. A resumed one is never removed.
+        A new folder is removed if the first iteration fails. A resumed folder is never removed.
         """
         try:
             yield
@@ -83,7 +86,7 @@ class FolderRun:
             raise
 
     def finish(self) -> RunResult:
-        """Write values, images and report at the end of the run. Raises as `observe` does."""
+        """Write values, images and report at the end of the run. Raises the same errors as `observe`."""
         problem = self._problem
         with problem.computing():
             run = ended(problem, self._run)
@@ -110,7 +113,7 @@ def require_targets(folder: Path, problem: Problem) -> None:
 
 
 def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolder, dict[str, Image]]:
-    """Create the folder of a run; returns it and the images at the initial values."""
+    """Create the folder of a run. Returns the folder and the images at the initial values by view name."""
     with problem.computing():
         before = render_views(problem, run.values)
     for view in problem.views:
@@ -122,9 +125,10 @@ def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tu
 
 def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
     config = problem.config
-    held = {v.key for v in problem.variables} if config.stages else set()  # stages may freeze some of them
+    held = {v.key for v in problem.variables} if config.stages else set()  # stages may freeze any of these variables
     before = go_on(folder.path, problem, run, held)
-    # All iterations are done but there is no report: the disk was full. Only the end is repeated.
+    # Without a report, even a run with all its iterations is resumed: writing the results has failed, for example
+    # because the disk was full, and is repeated.
     if not (folder.path / "report.html").exists():
         return before
     name = f"Run {folder.name}"

@@ -14,20 +14,23 @@ from pathreplay.inverse.parameters.values import Array
 from pathreplay.library.problem import Problem
 
 ValueAndGrad = Callable[..., tuple[float, dict[str, Array]]]
-"""(values=None, seed=0, spp=None) -> loss, gradients by name."""
+"""Function of (values=None, seed=0, spp=None) that returns the loss and the gradients by name."""
 
 
 def value_and_grad(problem: Problem) -> ValueAndGrad:
-    """The loss and its gradient as a function, as `jax.value_and_grad` gives one.
+    """Return a function that computes the loss and its gradients, like `jax.value_and_grad`.
 
     Args:
-        problem: what is evaluated; its kernels are recorded by the second call.
+        problem: the problem to evaluate. The second call of the function records kernels, which later calls replay.
 
     Returns:
-        ``f(values=None, seed=0, spp=None)``. ``values`` are arrays by name (left out: initial ones), ``seed`` decides
-        the paths, ``spp`` are samples per pixel. It gives the loss (mean over the views that are learned from, and
-        regularizers) and the gradients, arrays in the shapes of the values. Unbiased for ``l2`` and ``relative-l2``;
-        the loss itself carries the variance of the images on top. Entries that are NaN or infinite count as zero.
+        ``f(values=None, seed=0, spp=None)``, which returns the loss and the gradients by name. ``values`` are arrays by
+        name; missing values are initial values. ``seed`` selects the sampled paths, and ``spp`` is the number of
+        samples per pixel.
+
+        The loss is the mean over the training views plus regularizers, and includes the variance of the images. The
+        gradients have the shapes of the values and are unbiased for ``l2`` and ``relative-l2``. Gradient entries that
+        are NaN or infinite count as zero.
     """
     built = replace(problem.built, config=problem.built.config.model_copy(update={"stages": None}))
     config = built.config

@@ -1,4 +1,4 @@
-"""The optimisation loop that jobs and `minimize` share: iterations of a run, and its observers."""
+"""The optimisation loop of jobs and `minimize`: runs the iterations and passes their events to observers."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Iteration:
 
     @property
     def errors(self) -> Mapping[str, float]:
-        """Return the root mean square errors after the step, by name, of parameters whose true value is known."""
+        """Return the RMS errors after the step of the parameters whose true value is known, by name."""
         return self.entry.errors
 
     def render(self, view: int | str = 0, spp: int | None = None) -> Image:
@@ -75,14 +75,14 @@ class Iteration:
 
 
 def rendered(problem: Problem, values: Arrays, view: int | str, spp: int | None) -> Image:
-    """Render a view, given by index or name, with these values. Raises PathreplayError if it does not exist."""
+    """Render a view, given by index or name, with these values. Raises PathreplayError if there is no such view."""
     about = view_of(problem, view)
     with problem.computing():
         return picture_of(problem, values, about, spp)
 
 
 def view_of(problem: Problem, view: int | str) -> views.View:
-    """Return a view by index or name. Raises PathreplayError if it does not exist."""
+    """Return a view by index or name. Raises PathreplayError if there is no such view."""
     for n, each in enumerate(problem.views):
         if view in (n, n - len(problem.views), each.name):
             return each
@@ -90,11 +90,11 @@ def view_of(problem: Problem, view: int | str) -> views.View:
 
 
 def run_of(problem: Problem, pool: WorkerPool | None = None) -> Run:
-    """Create the run of a problem, and of its baseline, at the initial values.
+    """Create the run of a problem at the initial values, with the run of the baseline if there is one.
 
     Args:
         problem: the problem.
-        pool: actors that evaluate it; default: this process.
+        pool: Ray actors that evaluate the problem; None evaluates in this process.
 
     Returns:
         The run before its first iteration.
@@ -124,20 +124,20 @@ def iterations(
     observers: Sequence[Callable[[Event], None]],
     kept: FolderRun | None = None,
 ) -> Generator[Iteration, None, None]:
-    """Run the loop.
+    """Run the optimisation loop.
 
     Args:
         problem: the problem.
-        run: its run, which is modified.
-        stop: requests to stop after the current iteration.
-        observers: receive every event, before the iteration is yielded.
-        kept: the run in its folder, one of the observers, which saves a checkpoint when the generator is closed.
+        run: the run of the problem, which is modified.
+        stop: request to stop after the current iteration.
+        observers: functions that receive every event, before the iteration is yielded.
+        kept: writer of the run folder. It is also an observer, and saves a checkpoint when the generator is closed.
 
     Yields:
         Each iteration.
 
     Raises:
-        PathreplayError: see `inverse.loop.loop.iterate`, and the observers.
+        PathreplayError: the loop fails (see `inverse.loop.loop.iterate`), or an observer fails.
     """
     names = tuple(view.name for view in problem.views)
     folder = None if kept is None else kept.folder.path

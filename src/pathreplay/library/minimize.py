@@ -40,10 +40,10 @@ class Result:
     history: list[Entry]
     """One entry per iteration: loss, seconds, gradient norms and more."""
     stopped: str | None
-    """Why it ended early: 'a callback', 'Ctrl-C', 'the stop button', or the reason of the optimiser."""
+    """Why the run ended early: 'a callback', 'Ctrl-C', 'the stop button', or the reason of the optimiser."""
     problem: Problem
     folder: Path | None = None
-    """Run folder, which contains ``report.html``; None if there is none."""
+    """Run folder, which contains ``report.html``; None if no files were written."""
 
     def __repr__(self) -> str:
         """Return a short description for notebooks."""
@@ -56,7 +56,7 @@ class Result:
         return self.history[-1].loss if self.history else float("nan")
 
     def apply(self, scene: mi.Scene) -> None:
-        """Set the parameters of a scene to the result. The scene of the problem already has these values."""
+        """Set the parameters of a scene to the resulting values, which the problem's own scene already has."""
         self.problem.assign(self.values, scene)
 
     def render(self, view: int | str = 0, spp: int | None = None) -> Image:
@@ -64,7 +64,7 @@ class Result:
         return self.problem.render({v.key: self.values[v.key] for v in self.problem.built.variables}, view, spp)
 
 
-def minimize(  # noqa: PLR0913 (of which most are keywords)
+def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
     problem: Problem,
     optimizer: str | Mapping[str, object] | Stepper | object = None,
     steps: int | None = None,
@@ -84,19 +84,19 @@ def minimize(  # noqa: PLR0913 (of which most are keywords)
     """Minimise a problem from its initial values.
 
     Args:
-        problem: the problem. Its scene holds the result afterwards.
-        optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"`` or ``"l-bfgs-b"``; a mapping with
-            ``type`` and options; an empty optimizer of `mitsuba.ad`, whose learning rate applies to parameters without
-            their own; an object with ``step(values, gradients, learning_rates, loss) -> values``, arrays by name; or a
-            function with the interface of `scipy.optimize.minimize`, such as
-            ``functools.partial(scipy.optimize.minimize, method="SLSQP")``, for up to 1000 entries.
-        steps: number of iterations. Default: that of the problem's job, or 200.
+        problem: the problem. Afterwards its scene has the resulting values.
+        optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"``, ``"l-bfgs-b"``, or a mapping with
+            ``type`` and options. An optimizer of `mitsuba.ad` must be empty; its learning rate applies to parameters
+            without their own. Any other object needs ``step(values, gradients, learning_rates, loss) -> values``, with
+            arrays by name. A function needs the interface of `scipy.optimize.minimize`, such as
+            ``functools.partial(scipy.optimize.minimize, method="SLSQP")``, and supports up to 1000 entries.
+        steps: number of iterations. Default: ``iterations`` of the problem's job, or 200.
         callbacks: functions that are called with an `Iteration` after each step; one that returns True stops the loop.
-        progress: show a bar on a terminal, loss curve and images in a notebook, and lines elsewhere.
-        output: run folder for checkpoints, the page of ``pathreplay watch`` and the report, as of jobs. If it exists, a
+        progress: show a bar on a terminal, the loss curve and images in a notebook, or lines elsewhere.
+        output: run folder for checkpoints, the page of ``pathreplay watch`` and the report. If the folder exists, a
             number is appended. Default: no files are written.
         resume: resume the run in ``output`` from its last checkpoint, if the folder exists.
-        stages: tables of settings for parts of the run, as ``[[stages]]`` of jobs; their ``iterations`` replace
+        stages: tables of settings for parts of the run, like ``[[stages]]`` in a job; their ``iterations`` replace
             ``steps``.
         learning_rate_schedule: ``"constant"`` (the default), ``"exponential"``, ``"linear"`` or ``"cosine"``.
         final_learning_rate_ratio: final learning rate divided by the initial one.
@@ -106,7 +106,7 @@ def minimize(  # noqa: PLR0913 (of which most are keywords)
         **settings: further keys of a job, such as ``checkpoint_every``, ``preview`` or ``spp`` (docs/job-reference.md).
 
     Returns:
-        Values, history, and the reason if it ended early. A first Ctrl-C ends it after the current iteration.
+        Values and history, and why the run ended early, if so. The first Ctrl-C ends it after the current iteration.
 
     Raises:
         PathreplayError: settings are invalid, loss or values are not finite, or the folder is in use, damaged, or
@@ -172,7 +172,7 @@ def _minimized(
 
 
 def _run(problem: Problem, built: inner.Problem, own: object, stack: ExitStack, bar: Progress | NotebookPanel) -> Run:
-    """Create the run, with the user's optimizer if there is one."""
+    """Create the run; the user's optimizer, if any (``own``), replaces the configured one."""
     config = built.config
     pool = stack.enter_context(crew_of(config, problem.base, built, bar.remark, bar.status))
     run = run_of(built, pool)

@@ -1,4 +1,4 @@
-"""Adapters for foreign optimisers: those of `mitsuba.ad`, objects with a step method, and functions like SciPy's."""
+"""Adapters for optimisers of `mitsuba.ad`, objects with a step method, and functions like `scipy.optimize.minimize`."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from pathreplay.types import Json
 
 
 class Stepper(Protocol):
-    """An optimiser of the user.
+    """An optimiser object of the user.
 
-    With ``state_dict()``, which returns arrays by name, and ``load_state_dict(arrays)`` it can be resumed.
+    Runs can be resumed if the object also has ``state_dict()``, which returns arrays by name, and
+    ``load_state_dict(arrays)``.
     """
 
     def step(
@@ -32,7 +33,10 @@ class Stepper(Protocol):
 
 
 class OfMitsuba:
-    """An optimiser of `mitsuba.ad` or `drjit.opt`; variables in ``own`` have the learning rates of the problem."""
+    """An optimiser of `mitsuba.ad` or `drjit.opt`.
+
+    Variables in ``own`` use the learning rates of the problem, and all others the learning rate of the optimiser.
+    """
 
     finished = ""
 
@@ -63,7 +67,7 @@ class OfMitsuba:
         return {}
 
     def state(self) -> State:
-        """See `Optimiser`: the arrays that Dr.Jit keeps besides values and learning rates, numbered per variable."""
+        """See `Optimiser`. The arrays are Dr.Jit's state except values and learning rates, numbered per variable."""
         kept = {key: _leaves(self._optimizer.state[key][3:]) for key in self._steps}
         arrays = {f"{n}:{key}": np.array(leaf) for key, leaves in kept.items() for n, leaf in enumerate(leaves)}
         return State(dict(self._steps), arrays)
@@ -93,7 +97,7 @@ def _leaves(tree: object) -> list[dr.ArrayBase]:
 
 
 def _with_leaves(tree: object, leaves: Iterator[dr.ArrayBase]) -> Any:
-    """Replace the arrays of nested tuples."""
+    """Replace the arrays of nested tuples by ``leaves``, in order."""
     if isinstance(tree, tuple):
         return tuple(_with_leaves(branch, leaves) for branch in tree)
     return next(leaves) if dr.is_array_v(tree) else tree
@@ -105,7 +109,7 @@ class OfUser:
     finished = ""
 
     def __init__(self, stepper: Stepper, values: Arrays) -> None:
-        self._stepper: Any = stepper  # which may have a state
+        self._stepper: Any = stepper  # it may have state_dict() and load_state_dict(), too
         self._steps = dict.fromkeys(values, 0)
 
     def step(
@@ -151,7 +155,7 @@ class OfUser:
 
 
 def adapted(optimizer: Any, problem: Problem, values: Arrays) -> Optimiser:
-    """Adapt an optimizer object or a search function."""
+    """Convert the user's optimizer object, or a function like `scipy.optimize.minimize`, to an `Optimiser`."""
     if not hasattr(optimizer, "step"):
         return optimiser_of(problem, values, problem.config.optimizer, optimizer)
     if hasattr(optimizer, "set_learning_rate") and hasattr(optimizer, "keys"):
@@ -168,9 +172,10 @@ def _rated(problem: Problem) -> set[str]:
 
 
 def options_of(optimizer: object) -> tuple[Json | None, object]:
-    """Return the options of a built-in optimizer, and a foreign optimizer object or search function.
+    """Return the options of the job's ``optimizer``, and the user's optimizer object or search function.
 
-    Raises PathreplayError if it is neither.
+    Either is None if it does not apply. A search function also has options, with the type of search methods. Raises
+    PathreplayError for any other object.
     """
     if optimizer is None or isinstance(optimizer, str):
         return None if optimizer is None else {"type": optimizer}, None
@@ -181,7 +186,7 @@ def options_of(optimizer: object) -> tuple[Json | None, object]:
     if hasattr(optimizer, "step"):
         return None, optimizer
     if callable(optimizer):
-        return {"type": "l-bfgs-b"}, optimizer  # the type of search methods in jobs
+        return {"type": "l-bfgs-b"}, optimizer  # jobs treat all search methods like this type
     raise PathreplayError(
         f"optimizer: {type(optimizer).__name__} has no step(); give a name such as 'adam', an optimizer of "
         "mitsuba.ad, an object with step(values, gradients, learning_rates, loss), or a function like "

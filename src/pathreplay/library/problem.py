@@ -31,7 +31,7 @@ from pathreplay.scenes.loading import load_scene_for
 from pathreplay.types import Json
 
 MOST_ITERATIONS = 10**6
-"""Iterations of a problem that is not part of a run: larger than any iteration at which a grid is refined."""
+"""Iterations of a problem that is not part of a run. Every iteration at which a grid is refined is smaller."""
 OF_A_PROBLEM = frozenset(
     "scene scene_parameters sensors test_views variant integrator baseline parameters derived capture exposure "
     "view_weights target loss learning_rate deterministic memory_limit".split()
@@ -40,32 +40,33 @@ OF_A_PROBLEM = frozenset(
 
 
 class Problem:
-    """Minimise over the parameters the mean over views of loss(render(scene, view), target of the view).
+    """An inverse problem: minimise the mean of ``loss(render(scene, view), target)`` over all views.
 
-    The scene is not copied: it holds the values of the last evaluation. The integrator's boundary terms differentiate
-    visibility. Sampling decisions, Russian roulette and targets are not differentiated.
+    The unknowns are scene parameters. The scene is not copied, and has the values of the last evaluation. The
+    integrator's boundary terms differentiate visibility. Sampling decisions, Russian roulette and targets are not
+    differentiated.
 
     Args:
-        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. In the last three
-            cases a ``dielectric`` with an unknown index, and unknown 8-bit textures, are replaced by differentiable
-            plugins.
-        parameters: options by key of ``mi.traverse(scene)`` or glob; or keys alone.
+        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. Unless the scene
+            is already loaded, `dielectric_ad` replaces each ``dielectric`` if an index is a parameter, and 8-bit
+            textures that are parameters are loaded as floating-point numbers.
+        parameters: options by parameter key of ``mi.traverse(scene)`` or glob, or a sequence of keys without options.
         views: sensors and their targets.
         loss: a name (see `pathreplay.losses`), or ``loss(image, target)`` on tensors of shape (height, width, channels)
             that returns such a tensor or one number.
         integrator: an integrator or its dictionary. Default: `pathreplay` with the depth of the scene's integrator.
-        derived: scene parameters, by key or glob, computed from ``parameters``.
+        derived: scene parameters that are computed from ``parameters``, by key or glob.
         spp: samples per pixel of the image and of its derivative.
-        learning_rate: learning rate of parameters without their own.
+        learning_rate: learning rate of parameters that have none of their own.
         seed: seed of all random numbers.
-        deterministic: reproduce results to the bit, on one thread of an LLVM variant.
+        deterministic: reproduce results bit by bit; this uses one thread and needs an LLVM variant.
         **settings: further keys of a job, such as ``eval_spp``, ``exposure``, ``memory_limit`` (docs/job-reference.md).
 
     Raises:
         PathreplayError: the problem is invalid. This is checked before anything is rendered.
     """
 
-    def __init__(  # noqa: PLR0913 (of which most are keywords)
+    def __init__(  # noqa: PLR0913 (most arguments are keyword-only)
         self,
         scene: mi.Scene | Mapping[str, object] | str | Path,
         parameters: Mapping[str, Parameter | None] | Sequence[str] | str,
@@ -94,7 +95,7 @@ class Problem:
         integrator: Mapping[str, object] | mi.Integrator | None = None,
         derived: Mapping[str, Derived] | None = None,
     ) -> None:
-        """Replace parts of a job by the given objects, and build the problem."""
+        """Replace parts of the job's tables by the given objects, and build the problem."""
         self.base, self.job, objects = base, job, Objects()
         self.notes: tuple[str, ...] = ()
         if mi.variant() is None or "variant" in job:
@@ -123,7 +124,7 @@ class Problem:
             require_order(mi.variant())
         memory = inner.InMemory(own_scene, own_integrator, objects.functions, objects.starts)
         self.in_memory = memory != inner.InMemory()
-        """Whether it holds objects that the file of a job cannot name."""
+        """Whether the problem contains objects that a job file cannot describe."""
         known = {"iterations", "stages"} & set(job)
         config = make_config(job if known else {"iterations": MOST_ITERATIONS, **job}, "problem")
         self.built = inner.build_problem(config, base, targets, memory if self.in_memory else None)
@@ -134,12 +135,13 @@ class Problem:
         """Combine problems with different scenes into one, whose loss is the mean of their losses.
 
         Args:
-            problems: the problems. Parameters with the same name are shared: initial value, bounds, learning rate and
-                regularizers are those of the first problem that has it. Settings such as ``spp``, ``seed`` and
-                ``deterministic`` are those of the first problem.
+            problems: the problems. Parameters with the same name are shared; their initial value, bounds, learning rate
+                and regularizers come from the first problem that has the parameter. Settings such as ``spp``, ``seed``
+                and ``deterministic`` come from the first problem.
 
         Returns:
-            The combined problem. It uses the scenes of the problems; its views are called ``0-left``, ``1-left`` etc.
+            The combined problem, which uses the problems' scenes. Its views have names such as ``0-left`` and
+            ``1-left``.
 
         Raises:
             PathreplayError: shared parameters have different shapes, two problems have the same scene, or a problem has
@@ -174,7 +176,7 @@ class Problem:
 
     @property
     def initial(self) -> dict[str, Array]:
-        """Return the initial values by name; a pose has the names ``KEY:translation`` and ``KEY:rotation``."""
+        """Return the initial values by name; a pose has two: ``KEY:translation`` and ``KEY:rotation``."""
         return {v.key: np.array(v.start, np.float32) for v in self.built.variables}
 
     def render(
@@ -196,7 +198,7 @@ class Problem:
         return rendered(self.built, self.complete(values), view, spp)
 
     def complete(self, values: Mapping[str, ArrayLike] | None) -> dict[str, Array]:
-        """Complete values by initial values. Raises PathreplayError if a value has the wrong name or shape."""
+        """Add initial values for missing ones. Raises PathreplayError if a value has the wrong name or shape."""
         given, starts = values or {}, {v.key: v.start for v in self.built.variables}
         if unknown := set(given) - set(starts):
             raise PathreplayError(f"No parameter '{min(unknown)}' in the problem; it has {', '.join(starts)}")
@@ -213,7 +215,7 @@ class Problem:
             name: start of error messages.
 
         Returns:
-            The problem with the complete settings.
+            A problem with the same scene and targets, and with the job's settings overridden by the changes.
 
         Raises:
             PathreplayError: a setting is invalid, or fixed when the problem is created.
@@ -230,7 +232,7 @@ class Problem:
         return built
 
     def assign(self, values: Arrays, scene: mi.Scene) -> None:
-        """Set the parameters of a scene to these values. Raises PathreplayError if the scene does not have them."""
+        """Set the parameters of a scene to these values. Raises PathreplayError if the scene lacks one of them."""
         params, known = traversed(scene), self.built.scenes()
         found = [inner.scene_values(each, inner.variables_of(each, values)) for each in known]
         fitting = [each for each in found if each.keys() <= set(params.keys())]
@@ -244,7 +246,7 @@ class Problem:
 
 
 def run_settings(name: str, steps: int | None, options: Json | None, settings: Mapping[str, object]) -> Json:
-    """Collect the settings of a run as keys of a job; None stands for the default. ``name`` starts error messages."""
+    """Collect the settings of a run by job key, without those that are None. ``name`` starts error messages."""
     if "iterations" in settings:
         raise PathreplayError(f"{name}: 'iterations' is called 'steps' here")
     given = {"iterations": steps, "optimizer": options, **settings}
@@ -252,7 +254,10 @@ def run_settings(name: str, steps: int | None, options: Json | None, settings: M
 
 
 def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
-    """Convert a value of a parameter; textures and grids may have another resolution."""
+    """Convert a value to the ``wanted`` shape of its parameter. Textures and grids may have another resolution.
+
+    Raises PathreplayError if the shape does not fit.
+    """
     array = np.array(dr.detach(value) if dr.is_array_v(value) else value, np.float32)
     resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
     if array.shape != wanted and not resized and not (len(wanted) == 1 and array.size == wanted[0]):
@@ -261,7 +266,10 @@ def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
 
 
 def _loaded(scene: object, job: Json, base: Path) -> tuple[mi.Scene, tuple[str, ...]]:
-    """Load a scene, with differentiable plugins for the unknown parameters (see `load_scene_for`), and notes."""
+    """Load a scene so that the job's parameters are differentiable; returns the scene and notes on changes.
+
+    A loaded scene is returned unchanged. See `load_scene_for`.
+    """
     if isinstance(scene, mi.Scene):
         return scene, ()
     if not isinstance(scene, (Mapping, str, Path)):
@@ -276,11 +284,11 @@ def _loaded(scene: object, job: Json, base: Path) -> tuple[mi.Scene, tuple[str, 
 
 
 def _moved(job: Json, scene: mi.Scene, views: Sequence[View] | None) -> Targets | None:
-    """Change a job for a scene in memory, and for targets in memory if there are ``views``; returns these targets."""
+    """Change a job so that its scene is in memory and, if there are ``views``, its targets; return these targets."""
     said, job["scene"] = job.get("scene"), IN_MEMORY
     if views is None:
         if "images" not in job.get("target", {}) and "capture" not in job:
-            job["target"] = {"scene": said, **job.get("target", {})}  # from which targets are rendered
+            job["target"] = {"scene": said, **job.get("target", {})}  # the file's own scene still renders the targets
         return None
     named = by_name(scene, views)
     job.pop("capture", None)
@@ -303,10 +311,10 @@ def load_job(
     define: Sequence[str] = (),
     **settings: object,
 ) -> Problem:
-    """Create a problem from the file of a job, with changes.
+    """Create a problem from a job file, with changes.
 
-    Optimizer, iterations and schedule of the file are the defaults of `minimize`. Its ``output`` is ignored: only
-    `minimize` with ``output`` writes a folder.
+    The optimizer, iterations and schedule of the file are the defaults of `minimize`. The ``output`` of the file is
+    ignored: only `minimize` with ``output`` writes a folder.
 
     Args:
         path: a TOML, YAML or JSON file; relative paths in it refer to its folder.
@@ -316,7 +324,7 @@ def load_job(
         loss: replaces the loss of the file; see `Problem`.
         integrator: replaces the integrator of the file; see `Problem`.
         derived: replaces the derived parameters of the file; see `Problem`.
-        define: overrides ``KEY=VALUE``, as on the command line.
+        define: changes to the file, each ``KEY=VALUE`` like ``--set`` on the command line.
         **settings: keys of a job and their values, such as ``spp=8`` or ``stages=[...]``; None removes a key.
 
     Returns:
@@ -326,7 +334,7 @@ def load_job(
         PathreplayError: the file cannot be read, or the problem is invalid.
     """
     table = read_table(Path(path), define)
-    make_config(table, str(path))  # for its error messages
+    make_config(table, str(path))  # checks the file alone, so that error messages name the file
     table = {key: value for key, value in {**table, **settings}.items() if value is not None}
     problem = Problem.__new__(Problem)
     problem._build(table, Path(path).parent.absolute(), scene, parameters, views, loss, integrator, derived)

@@ -21,7 +21,7 @@ from pathreplay.library.problem import Problem, run_settings
 
 
 class _Task:
-    """Settings and kernels shared by the states of one optimisation, and an optimiser synchronised with one of them."""
+    """Settings and kernels that all states of an optimisation share, and an optimiser in sync with the state ``at``."""
 
     def __init__(self, changes: Mapping[str, object]) -> None:
         self._changes = changes
@@ -32,7 +32,7 @@ class _Task:
         self.optimiser: adaptive.Optimiser | None = None
 
     def of(self, problem: Problem, name: str = "step") -> tuple[inner.Problem, Executor]:
-        """Return the problem with these settings, and its executor. ``name`` starts error messages."""
+        """Return a problem with the settings of this task, and its executor. ``name`` starts error messages."""
         if problem not in self._known:
             built = problem.configured(self._changes, name)
             config = built.config
@@ -41,11 +41,11 @@ class _Task:
         return self._known[problem]
 
     def optimiser_at(self, state: State, built: inner.Problem) -> adaptive.Optimiser:
-        """Return an optimiser synchronised with the state."""
+        """Return an optimiser whose internal state is that of ``state``."""
         if self.optimiser is None or self.at is not state:
             self.optimiser = self.own or optimiser_of(built, state._next, built.config.optimizer)
             self.optimiser.restore(state._kept, state._next)
-        self.at = None  # not synchronised until the step has succeeded
+        self.at = None  # in sync with no state until the step has succeeded
         return self.optimiser
 
 
@@ -54,7 +54,7 @@ class State:
     """State of an optimisation, immutable: `step` returns the next one."""
 
     values: Mapping[str, Array]
-    """Values by name; of search methods such as ``l-bfgs-b``, the best ones so far."""
+    """Values by name. Search methods such as ``l-bfgs-b`` give the best values so far."""
     history: tuple[Entry, ...]
     """One entry per step: loss, seconds, gradient norms and more."""
     finished: str
@@ -87,7 +87,7 @@ def init(
         problem: the problem.
         optimizer: see `minimize`. A custom object needs ``state_dict()`` and ``load_state_dict(arrays)``. The object is
             modified by `step` and must not be used elsewhere.
-        steps: length of the learning rate schedule; the last rate is kept afterwards. Default: see `minimize`.
+        steps: length of the learning rate schedule, after which the last rate is kept. Default: see `minimize`.
         **settings: see `minimize`, such as ``stages``, ``learning_rate_schedule`` or ``view_batch_size``.
 
     Returns:
@@ -108,9 +108,9 @@ def init(
 def step(problem: Problem, state: State) -> State:
     """Take one optimisation step: evaluate loss and gradient, and update the values.
 
-    The function is pure up to rounding in multithreaded sums; with ``deterministic`` it is pure to the bit. The problem
-    may change from step to step, if its parameters stay the same. The second step of each problem records kernels,
-    which later steps replay.
+    The function is pure up to rounding in multithreaded sums; with ``deterministic``, it is bitwise pure. The problem
+    may differ from step to step if its parameters stay the same. The second step of each problem records kernels, which
+    later steps replay.
 
     Args:
         problem: the problem.

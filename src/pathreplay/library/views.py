@@ -1,4 +1,4 @@
-"""Conversion of views: sensors by name, targets and weights as arrays, checked against the films."""
+"""Converts views to sensor names, and their targets and weights to arrays, which are checked against the films."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pathreplay.library.descriptions import View
 
 
 def by_name(scene: mi.Scene, views: Sequence[View]) -> dict[str, View]:
-    """Return views by sensor name. Raises PathreplayError if two have the same sensor, or there is none."""
+    """Return views by sensor name. Raises PathreplayError if two views have the same sensor, or there is no view."""
     found: dict[str, View] = {}
     for view in views:
         name = next(iter(sensors_of(scene, [view.sensor])))

@@ -40,19 +40,20 @@ _OPTION = "-o"
 def export_run(run: Path, output: Path | None = None) -> str:
     """Export the scene of a run with its final values.
 
-    Writes `scene.xml` with its files (textures as EXR, grids as `.vol`, meshes as PLY), recovered textures and meshes
-    also as PNG and OBJ, the cameras as `transforms.json`, small values in `values.json`, and large ones as NPY. The
-    run's variant becomes the active one.
+    The folder contains `scene.xml` and the files that it references (textures as EXR, grids as `.vol`, meshes as PLY).
+    Recovered textures and meshes are also written as PNG and OBJ, cameras as `transforms.json`, small values to
+    `values.json`, and large values outside the scene as NPY. The function sets the variant of the run.
 
     Args:
         run: run folder.
         output: new or empty folder to write to; the default is ``export`` in the run folder.
 
     Returns:
-        Lines for the user: how to render the scene, the written files, and notes.
+        Lines for the user: the command that renders the scene, the written files, and notes.
 
     Raises:
-        PathreplayError: ``run`` is not a run folder, has no result, or cannot be exported. Nothing is written then.
+        PathreplayError: ``run`` is not a run folder, has no result, or cannot be exported. In these cases nothing is
+            written.
     """
     folder = run / "export" if output is None else output
     require_writable_name(run, "RUN")
@@ -72,7 +73,7 @@ def export_run(run: Path, output: Path | None = None) -> str:
             (part / name).write_bytes(data)
         require_same(export.scene, part)
     files = sorted([*export.files, *export.copies])
-    # Mitsuba's own command would load the system's newest LLVM, and some versions crash it.
+    # The command `mitsuba` would load the system's newest LLVM, and some versions of LLVM crash Mitsuba.
     render = f"pathreplay render {shlex.quote(str(folder / SCENE))} -o scene.exr --variant {mi.variant()}"
     lines = [f"{folder / SCENE}: render it with `{render}`"]
     lines += [f"{folder / name}" for name in files if name != SCENE and not name.startswith("files/")]
@@ -80,7 +81,7 @@ def export_run(run: Path, output: Path | None = None) -> str:
 
 
 def write_files(export: Exported, folder: Path) -> None:
-    """Write the scene and its files into an existing folder."""
+    """Write the scene and its files into an existing folder. Raises PathreplayError if a file cannot be copied."""
     for name in [*export.files, *export.copies]:
         (folder / name).parent.mkdir(exist_ok=True)
     for name, data in export.files.items():
@@ -93,7 +94,7 @@ def write_files(export: Exported, folder: Path) -> None:
 
 
 def _result(run: Path) -> dict[str, np.ndarray]:
-    """Decoded values of the scene's parameters at the end of a run."""
+    """Return the decoded parameter values at the end of a run. Raises PathreplayError if the run has no result."""
     path = run / "parameters.safetensors"
     if not path.is_file():
         raise PathreplayError(
@@ -104,7 +105,7 @@ def _result(run: Path) -> dict[str, np.ndarray]:
         values = safetensors.numpy.load_file(str(path))
     except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise PathreplayError(f"Result {path} cannot be read ({error}); resume the run, which writes it") from None
-    # Omit translation and rotation of poses; the resulting transform or vertices have a key of their own.
+    # Omit translation and rotation of poses: the resulting transform or vertices have a separate key.
     return {k: v for k, v in values.items() if not k.endswith(PART_NAMES)}
 
 
@@ -128,20 +129,20 @@ def _source(job: Job, values: Arrays) -> Source:
 
 
 def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
-    """Image files of textures that the run has stored as floating-point numbers."""
+    """Return the 8-bit image files whose textures the run has optimized, and stored as floating-point numbers."""
     keys = [key for key in values if key.endswith(".data")]
     if not keys:
         return ()
     with errors_as("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         pictures = coarse_pictures(traversed(source.load()), keys)
-    gc.collect()  # Dr.Jit traces virtual calls through every instance alive
+    gc.collect()  # free the scene: Dr.Jit traces virtual calls through every instance in memory
     return pictures
 
 
 def _beside(export: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
-    """Files that the scene does not reference: PNG, OBJ, cameras, and numbers.
+    """Return the content of the files that the scene does not reference, by name: PNG, OBJ, NPY, cameras, and numbers.
 
-    ``free`` are parameters outside the scene; large ones become NPY files.
+    ``free`` are parameters outside the scene; if they have more than 16 numbers, they become NPY files.
     """
     params, files = mi.traverse(export.scene), {"transforms.json": _json(_cameras(export.scene))}
     names = file_names([*params.keys(), *(shape.id() for shape in export.scene.shapes())])
@@ -188,7 +189,7 @@ def obj_bytes(mesh: mi.Mesh) -> bytes:
 
 
 def _cameras(scene: mi.Scene) -> Json:
-    """The pinhole cameras in the format of NeRF's `transforms.json`."""
+    """Return the pinhole cameras of a scene in the format of NeRF's `transforms.json`."""
     frames = []
     for sensor in scene.sensors():
         params = mi.traverse(sensor)

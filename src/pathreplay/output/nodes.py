@@ -1,7 +1,8 @@
-"""The parsed description of a scene for writing: its objects, and the object that each parameter belongs to.
+"""Parses a scene description for writing into objects, and finds the object that each parameter belongs to.
 
-Parameters have the keys of `mi.traverse(scene)`, whereas the parser knows objects and their properties. To relate them,
-the scene is instantiated once with a unique id per object, and the id of a parameter's owner identifies the object.
+Parameters have the keys of `mi.traverse(scene)`, whereas the parser knows objects and their properties. To relate
+parameters to objects, the scene is instantiated once with a unique id per object. The id of the instance that has a
+parameter then identifies the object.
 """
 
 from __future__ import annotations
@@ -26,33 +27,33 @@ Node: TypeAlias = "mi.parser.SceneNode"
 
 @dataclass(frozen=True)
 class Owner:
-    """Owner of a parameter: the object in the description, and the place in it, as 'reflectance.value' or 'data'."""
+    """The object that a parameter belongs to, and the path of the parameter in it, as 'reflectance.value' or 'data'."""
 
     node: Node
     place: str
 
 
 class Described:
-    """The objects of a scene description; the first is the scene itself."""
+    """The objects of a scene description; the first object is the scene."""
 
     def __init__(self, state: mi.parser.ParserState, folder: Path | None) -> None:
         self._state, self.nodes, self.folder = state, list(state.nodes), folder
 
     def add(self, properties: mi.Properties, kind: mi.ObjectType) -> mi.Properties.ResolvedReference:
-        """Add an object; returns a reference to it for use as a property value."""
+        """Add an object, and return a reference to the object for use as a property value."""
         node = mi.parser.SceneNode()
         node.props, node.type = properties, kind
         self.nodes.append(node)
         return mi.Properties.ResolvedReference(len(self.nodes) - 1)
 
     def children(self, node: Node) -> Iterator[tuple[str, Node]]:
-        """The child objects of an object, with their property names."""
+        """Yield the child objects of an object, each with its property name."""
         for name in node.props.keys():
             if _is_reference(node, name):
                 yield name, self.nodes[node.props.get(name).index()]
 
     def find_file(self, name: str) -> Path:
-        """Resolve a file name of a property; relative names start at the scene's folder."""
+        """Resolve a file name of a property; relative names refer to the scene's folder."""
         with _resolving(self.folder):
             return Path(str(mi.file_resolver().resolve(name)))
 
@@ -86,13 +87,13 @@ def describe(
     Args:
         scene: path of an XML file, or a dictionary.
         arguments: values that replace ``$name`` in the file.
-        plugins: plugin types to replace (old type -> new type).
+        plugins: new plugin types by the old types that they replace.
         cameras: dictionaries of additional sensors by id.
         floats: image files of textures to store as floating-point numbers; see `load_file_with`.
 
     Raises:
         RuntimeError: Mitsuba cannot read the scene.
-        PathreplayError: as in `load_file_with`.
+        PathreplayError: see `load_file_with`.
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
@@ -128,8 +129,8 @@ def _join(state: mi.parser.ParserState, name: str, camera: mi.parser.ParserState
 
 
 def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes: list[Node]) -> list[Owner]:
-    """Owners of all parameters, from an instance of the scene in which each object has a unique id."""
-    copy = mi.parser.ParserState(state)  # instantiation replaces references by objects
+    """Return the owners of all parameters, from an instance of the scene in which each object has a unique id."""
+    copy = mi.parser.ParserState(state)  # because instantiation replaces references by objects
     names = {f"object {i}": i for i in range(1, len(nodes))}
     for name, i in names.items():
         copy.nodes[i].props.set_id(name)
@@ -147,12 +148,15 @@ def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes:
 
 
 def _deepest(described: Described, owner: Owner) -> Owner:
-    """Follow the place of a parameter to nested objects, including bitmaps, which do not keep their ids."""
+    """Follow the place of a parameter to the innermost object.
+
+    `_owners` misses some objects: for example, the instance of a bitmap does not keep its id.
+    """
     name, dot, rest = owner.place.partition(".")
     if not dot:
         return owner
     children = dict(described.children(owner.node))
-    if name not in children:  # the file uses another name; a single bitmap child is unambiguous
+    if name not in children:  # the file uses another property name; if only one child is a bitmap, it is meant
         pictures = [child for child in children.values() if child.props.plugin_name() == "bitmap"]
         if rest.split(".")[-1] != "data" or len(pictures) != 1:
             return owner
@@ -161,7 +165,7 @@ def _deepest(described: Described, owner: Owner) -> Owner:
 
 
 def require_no_objects(described: Described) -> None:
-    """Raise PathreplayError for an object that was instantiated before parsing: its description is unknown."""
+    """Raise PathreplayError if an object was instantiated before parsing, because its description is unknown."""
     for node in described.nodes:
         for name in node.props.keys():
             kind = node.props.type(name)

@@ -1,4 +1,4 @@
-"""Renders a scene with any integrator, in as many passes as sampler and memory require, and encodes the image."""
+"""Renders a scene with any integrator, in as many passes as the sampler and memory require, and encodes the image."""
 
 from __future__ import annotations
 
@@ -20,29 +20,32 @@ from pathreplay.inverse.images.io import Image, png_bytes
 from pathreplay.platform import memory
 from pathreplay.scenes.descriptions import errors_as
 
-# Samples per pass with independent samples: a few seconds, so that the bar moves and Ctrl-C takes effect.
+# Samples per pass of the `independent` sampler. Passes take a few seconds, so that bar and Ctrl-C respond soon.
 _A_PASS = 2**24
-# Bytes per sample during a pass: two copies of the state of its random numbers.
+# Bytes per sample during a pass, for two copies of the state of its random number generator.
 _A_SAMPLE = 64
-# Larger sizes are likely typing errors, and films of that size end in an error of Mitsuba at best.
+# Pixels. A larger size is probably a typing error, for which Mitsuba at best raises an error.
 _LARGEST_SIDE = 2**16
 
 Told = Callable[[int, int], None]
-"""Called with the number of completed passes and their total."""
+"""Function that is called with the number of completed passes and the number of all passes."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Linear pixels (height, width, channels), and the channel names: R, G, B, A, Y, or those of AOVs."""
+    """A rendered image with linear pixels (height, width, channels).
+
+    The names of the ``channels`` are R, G, B, A and Y, or those of AOVs.
+    """
 
     image: Image
     channels: tuple[str, ...]
     spp: int
-    """Samples per pixel actually taken; samplers may round up."""
+    """Number of samples per pixel that were taken; samplers may round up."""
 
 
 def find_sensor(scene: mi.Scene, wanted: str | None) -> mi.Sensor:
-    """The sensor with the given id or index, or the first. Raises PathreplayError if it does not exist."""
+    """Return the sensor with the given id or index; None: the first. Raises PathreplayError if it does not exist."""
     sensors = scene.sensors()
     if not sensors:
         raise PathreplayError("The scene has no sensor; add one")
@@ -82,12 +85,13 @@ def set_size(sensor: mi.Sensor, size: str) -> None:
 
 
 def passes(sensor: mi.Sensor, spp: int) -> list[int]:
-    """Samples per pixel of each pass; their sum is ``spp``, or more if the sampler rounds up.
+    """Return the samples per pixel of each pass. Their sum is ``spp``, or more if the sampler rounds up.
 
     Samplers other than `independent` stratify the samples of a pixel. Their samples are split only if Dr.Jit or the
-    memory cannot hold them at once, into passes of a power of four, which all samplers accept.
+    memory cannot hold all samples at once. Each of these passes has a power of four samples per pixel, which all
+    samplers accept.
 
-    Raises PathreplayError for images that do not fit into memory.
+    Raises PathreplayError if the image does not fit into memory.
     """
     require_film(sensor, f"sensor '{sensor.id()}'", {})
     pixels = math.prod(int(n) for n in sensor.film().crop_size())
@@ -100,15 +104,15 @@ def passes(sensor: mi.Sensor, spp: int) -> list[int]:
 def render(
     scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator, spp: int, seed: int = 0, tell: Told | None = None
 ) -> Rendering:
-    """Render the mean of all `passes`; a single pass equals `mi.render` with the same seed.
+    """Render the mean of all `passes`. An image of a single pass equals that of `mi.render` with the same seed.
 
     Args:
         scene: scene to render.
-        sensor: one of its sensors.
+        sensor: sensor of the scene.
         integrator: any integrator.
-        spp: samples per pixel, rounded up by some samplers.
+        spp: samples per pixel, which some samplers round up.
         seed: seed of the first pass, from which the seeds of further passes are derived.
-        tell: receives the number of completed passes and their total.
+        tell: receives the number of completed passes and of all passes.
 
     Raises:
         PathreplayError: the integrator cannot render the scene.
@@ -128,7 +132,7 @@ def render(
     names = tuple(field.name for field in sensor.film().bitmap().struct_())
     picture = (total / done).astype(np.float32)
     picture = picture[:, :, None] if picture.ndim == 2 else picture
-    # If the integrator only returns AOVs, the image has no colour channels, unlike the film.
+    # If the integrator returns only AOVs, the image lacks the colour channels that the film has.
     return Rendering(picture, names[len(names) - picture.shape[2] :], done)
 
 
@@ -145,7 +149,7 @@ def file_bytes(rendering: Rendering, ending: str) -> bytes:
         return png_bytes(rendering.image)
     channels = {n: np.ascontiguousarray(rendering.image[:, :, i]) for i, n in enumerate(rendering.channels)}
     buffer = io.BytesIO()
-    # Mitsuba's writer is not used; see `exr_bytes`.
+    # Mitsuba's writer is not used, because it can deadlock; see `exr_bytes`.
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, channels, num_threads=0) as file:
         file.write(buffer)

@@ -25,17 +25,18 @@ _ALSO_PLACES = {
     "point": ("position",),
     "directional": ("direction",),
 }
-"""Properties that are part of the `to_world` of `mi.traverse`, by plugin."""
+"""Properties by plugin that `mi.traverse` includes in `to_world`."""
 
-# Classes of existing objects that are supported on a mesh: their plugin, and their only property.
+# Plugin and only property of each class of materials and emitters that an existing mesh object may have.
 _KNOWN = {"SmoothDiffuse": ("diffuse", "reflectance"), "AreaLight": ("area", "radiance")}
 _PLAIN_SPECTRA = ("SRGBReflectanceSpectrum", "UniformSpectrum")
 
 
 class Placing:
-    """Writes the current values of a scene into its description; ``files`` (name -> bytes) are the files it needs.
+    """Writes the current values of a scene into its description.
 
-    ``names`` are file names by parameter key.
+    ``names`` are file names by parameter key. ``files`` collects the content of the files that the description needs,
+    by name.
     """
 
     def __init__(self, described: Described, scene: mi.Scene, names: dict[str, str]) -> None:
@@ -45,7 +46,7 @@ class Placing:
         self._meshes: dict[str, str] = {}
 
     def put(self, key: str, owner: Owner) -> None:
-        """Write the value of a parameter to its owner. Raises PathreplayError if no property can hold it."""
+        """Write the value of a parameter to its owner. Raises PathreplayError if no property can store the value."""
         node, place = owner.node, owner.place
         plugin = node.props.plugin_name()
         if plugin in _PICTURES and place == "data":
@@ -61,7 +62,7 @@ class Placing:
             self._number(key, node, place)
 
     def meshes(self) -> None:
-        """Replace existing mesh objects by files, and describe their materials and emitters by properties."""
+        """Replace mesh objects in the description by files, and their materials and emitters by properties."""
         for parent in list(self.described.nodes):
             for name in list(parent.props.keys()):
                 value = parent.props.get(name) if parent.props.type(name) == mi.Properties.Type.Object else None
@@ -92,7 +93,7 @@ class Placing:
         if grid is None:
             grid = mi.VolumeGrid(str(self.described.find_file(node.props.get("filename"))))
         stream = mi.MemoryStream()
-        grid.write(stream)  # the box is in the file, and has no accessor in Python
+        grid.write(stream)  # the box is only accessible in Python as a part of the file
         return vol_bounds(stream.raw_buffer())
 
     def _mesh(self, mesh: mi.Mesh, node: Node) -> None:
@@ -101,7 +102,7 @@ class Placing:
         node.props["filename"] = self._ply(mesh, node.props.id())
 
     def _ply(self, mesh: mi.Mesh, name: str) -> str:
-        """Add the file of a mesh unless it exists; returns its name."""
+        """Add the PLY file of a mesh, unless it was added before, and return the file's name."""
         if mesh.id() not in self._meshes:
             stream = mi.MemoryStream()
             mesh.write_ply(stream)
@@ -125,7 +126,10 @@ class Placing:
         parent.props[name] = self.described.add(properties, mi.ObjectType.Shape)
 
     def _known(self, instance: mi.Object, what: str) -> mi.Properties:
-        """Properties of an existing object that its parameters determine completely."""
+        """Return properties that describe an existing object, for classes whose parameters determine the object.
+
+        Raises PathreplayError for other classes.
+        """
         plugin, part = _KNOWN.get(instance.class_name(), ("", ""))
         params = mi.traverse(instance)
         owner = params.properties[f"{part}.value"][2] if f"{part}.value" in params else None
@@ -184,12 +188,15 @@ def _set_colour(properties: mi.Properties, name: str, value: np.ndarray) -> None
 
 
 def made_otherwise(node: Node) -> bool:
-    """Whether the values of a texture or grid were given as an object or an array instead of a file."""
+    """Return whether the values of a texture or grid were given as an object or an array instead of a file."""
     return any(name in node.props for name in ("bitmap", "grid", "data"))
 
 
 def copied_files(described: Described, placed: dict[str, bytes]) -> dict[str, Path]:
-    """Files that the scene references besides those ``placed``: new name -> path. The scene gets the new names."""
+    """Return the files that the scene references, except those in ``placed``: paths by new name.
+
+    The new names replace the old names in the description.
+    """
     copies: dict[str, Path] = {}
     for node in described.nodes:
         name = node.props.get("filename", None)

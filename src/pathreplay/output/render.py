@@ -21,15 +21,15 @@ from pathreplay.types import Json
 
 _OPTION = "-o"
 _SECONDS = 10.0
-# More is likely a typing error: the noise of an image is then below single precision.
+# A larger number is probably a typing error: the noise of the image would be below single precision.
 _MOST_SPP = 10**6
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What to render. None means the scene's own setting."""
+    """Options of a rendering. None selects the scene's own setting."""
 
-    integrator: str | None = None  # plugin name; without one in the scene: path
+    integrator: str | None = None  # plugin name; default: the scene's integrator, or `path` if the scene has none
     options: Sequence[str] = ()  # integrator properties, each NAME=VALUE
     sensor: str | None = None  # id or index
     size: str | None = None  # WIDTHxHEIGHT or WIDTH
@@ -39,7 +39,7 @@ class RenderOptions:
 
 
 def render_to_file(scene: str, output: Path, asked: RenderOptions, progress: bool = True) -> str:
-    """Render a scene to a file in the active variant; returns a line about it.
+    """Render a scene to a file in the active variant.
 
     Args:
         scene: path of an XML file, or name of a built-in scene.
@@ -47,8 +47,11 @@ def render_to_file(scene: str, output: Path, asked: RenderOptions, progress: boo
         asked: integrator, sensor, film size and samples.
         progress: show a bar on stderr.
 
+    Returns:
+        A line for the user: file, size, samples per pixel and time.
+
     Raises:
-        PathreplayError: an argument is invalid, or the scene cannot be rendered; the file is unchanged then.
+        PathreplayError: an argument is invalid, or the scene cannot be rendered. An existing file stays unchanged.
     """
     integrator, options, spp, seed = asked.integrator, asked.options, asked.spp, asked.seed
     ending = output.suffix.lower()
@@ -79,7 +82,7 @@ def render_to_file(scene: str, output: Path, asked: RenderOptions, progress: boo
 
 
 def _flat(option: str, table: Json, changes: Sequence[str]) -> Json:
-    """Add each NAME=VALUE to the table. Raises PathreplayError for nested values."""
+    """Return the table with each NAME=VALUE added. Raises PathreplayError for nested values."""
     result = defined(table, changes, option)
     for name, value in result.items():
         if isinstance(value, (dict, list)):
@@ -89,7 +92,7 @@ def _flat(option: str, table: Json, changes: Sequence[str]) -> Json:
 
 @contextmanager
 def _bar(shown: bool) -> Iterator[Told | None]:
-    """A transient bar on stderr, or periodic lines if stderr is not a terminal."""
+    """Show a transient bar on stderr, or periodic lines if stderr is not a terminal; yields the update function."""
     console = Console(stderr=True, force_jupyter=False)
     columns = (TextColumn("rendering, pass"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not (shown and console.is_terminal)) as bar:

@@ -1,4 +1,4 @@
-"""Exports a scene as a folder: Mitsuba XML and the files it references, which `mitsuba` renders to the same image."""
+"""Exports a scene to a folder with Mitsuba XML and all referenced files, which `mitsuba` renders to the same image."""
 
 from __future__ import annotations
 
@@ -36,31 +36,31 @@ _STANDS_IN = {"dielectric_ad": "dielectric"}
 _DEPTHS = {"direct_projective": 2} | dict.fromkeys(
     ("pathreplay", "prb", "prb_basic", "prb_projective", "rb", "prbvolpath"), 6
 )
-"""Differentiable integrators, which `path` or `volpath` replaces, and their default depth."""
+"""Default depths of the differentiable integrators, which `path` or `volpath` replaces in exported scenes."""
 _KEPT = ("max_depth", "rr_depth", "hide_emitters")
 """Properties that `path` and `volpath` share with differentiable integrators."""
 
-# A memory address, which Mitsuba uses as the name of an object without id.
+# Name that Mitsuba gives to an object without id; the number is a memory address.
 _ADDRESS = re.compile(r"object_\d+")
 
 
 @dataclass(frozen=True)
 class Source:
-    """The source of a scene, before values are assigned."""
+    """The description of a scene, before recovered values are assigned."""
 
     scene: str | Path | Mapping[str, object]
     """Path of an XML file, or a Mitsuba dictionary."""
     arguments: Mapping[str, str]
     """Values that replace ``$name`` in the file."""
     plugins: Mapping[str, str]
-    """Replaced plugin types, old -> new."""
+    """New plugin types by the old types that they replace."""
     cameras: Mapping[str, Mapping[str, object]]
     """Additional sensors by id."""
     floats: Collection[str] = ()
     """Image files of textures that are stored as floating-point numbers; see `load_file_with`."""
 
     def load(self) -> mi.Scene:
-        """Load the scene. Raises what Mitsuba and `load_file_with` raise."""
+        """Load the scene. Raises the errors of Mitsuba and of `load_file_with`."""
         if isinstance(self.scene, Mapping):
             return load_dict_with(self.scene, self.plugins, self.cameras, self.floats)[0]
         return load_file_with(self.scene, self.plugins, self.arguments, self.cameras, self.floats)[0]
@@ -68,13 +68,13 @@ class Source:
 
 @dataclass(frozen=True)
 class Exported:
-    """A scene with its values, and its files."""
+    """An exported scene: the scene with the assigned values, and its files."""
 
     scene: mi.Scene
     files: dict[str, bytes]
-    """Content by name."""
+    """Content of new files by name."""
     copies: dict[str, Path]
-    """Files to copy: name -> original."""
+    """Paths of files to copy, by new name."""
     notes: tuple[str, ...]
     """Differences from the original scene."""
 
@@ -85,14 +85,14 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
     Args:
         source: the scene.
         values: decoded values by parameter key.
-        integrator: dictionary of the integrator; the default is the scene's, else `pathreplay`. `path` or `volpath`
-            replaces a differentiable integrator.
+        integrator: dictionary of the integrator; default: the scene's integrator, or `pathreplay` if the scene has
+            none. `path` or `volpath` replaces a differentiable integrator.
 
     Returns:
         The scene with these values, and the content of its files.
 
     Raises:
-        PathreplayError: the scene has something that no scene file of Mitsuba can hold.
+        PathreplayError: a Mitsuba scene file cannot describe a part of the scene.
     """
     with errors_as("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene = source.load()
@@ -103,7 +103,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
         raise PathreplayError("The scene differs each time it is loaded, and cannot be exported")
     placing = Placing(described, scene, _file_names(keys, scene))
     for key, owner in zip(keys, owners, strict=True):
-        if owner.node is described.nodes[0]:  # belongs to an existing mesh object, which `meshes` handles
+        if owner.node is described.nodes[0]:  # a parameter of an existing mesh object, which `meshes` handles
             continue
         if key in values or (owner.place == "data" and made_otherwise(owner.node)):
             placing.put(key, owner)
@@ -116,12 +116,12 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
 
 
 def require_same(original: mi.Scene, folder: Path) -> None:
-    """Raise PathreplayError unless the exported scene has the parameters of the original, up to rounding."""
+    """Raise PathreplayError unless the exported scene has the parameter values of the original, up to rounding."""
     gc.collect()
     with errors_as(f"The exported scene {folder / SCENE} cannot be loaded"), spare_thread():
         copy = mi.load_file(str(folder / SCENE), optimize=False)
     ours, theirs = traversed(original), traversed(copy)
-    # Objects without id are in the same order in both scenes.
+    # Match objects without id by their order, which is the same in both scenes.
     waiting: defaultdict[str, list[str]] = defaultdict(list)
     for key in theirs.keys():
         waiting[_ADDRESS.sub("object", key)].append(key)
@@ -176,7 +176,7 @@ def _file_names(keys: list[str], scene: mi.Scene) -> dict[str, str]:
 
 
 def _plain_plugins(described: Described) -> list[str]:
-    """Replace our plugins by Mitsuba's; returns notes on plugins without equivalent."""
+    """Replace pathreplay's plugins by equivalents of Mitsuba, and return notes on plugins without an equivalent."""
     notes = []
     for node in described.nodes:
         name = node.props.plugin_name()
@@ -188,7 +188,10 @@ def _plain_plugins(described: Described) -> list[str]:
 
 
 def _plain_integrator(described: Described, wanted: Mapping[str, object] | None) -> list[str]:
-    """Set the wanted integrator, else the scene's; replaces a differentiable one, and returns a note about it."""
+    """Set the ``wanted`` integrator; default: the scene's, or `pathreplay` if the scene has none.
+
+    `path` or `volpath` replaces a differentiable integrator; a returned note says so.
+    """
     root = described.nodes[0]
     children = dict(described.children(root))
     own = next((name for name, node in children.items() if node.type == mi.ObjectType.Integrator), None)

@@ -26,10 +26,10 @@ _UNNAMED = "_arg_"
 
 
 def scene_xml(described: Described, from_file: bool) -> bytes:
-    """Encode the scene as an XML file.
+    """Encode a scene description as an XML file.
 
-    ``from_file`` says that it was read from a file, where the user has chosen the ids. Raises PathreplayError for
-    values that XML cannot hold.
+    ``from_file`` means that the description was read from a file, in which the user has chosen the ids. Raises
+    PathreplayError for values that XML cannot represent.
     """
     uses = Counter(id(child) for node in described.nodes for _, child in described.children(node))
     names = _Names(described, uses, from_file)
@@ -40,7 +40,7 @@ def scene_xml(described: Described, from_file: bool) -> bytes:
 
 
 class _Names:
-    """The ids that objects get: only those that are referenced, or are part of parameter keys."""
+    """The ids of objects in the XML file. Only objects that are referenced or part of parameter keys have an id."""
 
     def __init__(self, described: Described, uses: Counter[int], from_file: bool) -> None:
         top = {id(child) for _, child in described.children(described.nodes[0])}

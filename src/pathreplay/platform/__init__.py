@@ -1,1 +1,1 @@
-"""The platform: LLVM and variants, devices, memory, threads, signals and files."""
+"""The platform: LLVM, Mitsuba variants, devices, memory, threads, signals and files."""

@@ -10,7 +10,10 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 LEAST = 700_000 * 1024
-"""Bytes. With 600 000 kB matplotlib's libraries cannot be mapped; with 450 000 kB loading Mitsuba hangs."""
+"""Smallest usable limit in bytes.
+
+With 600 000 kB, matplotlib's libraries cannot be mapped; with 450 000 kB, loading Mitsuba hangs.
+"""
 
 _SIGNS = ("failed to map segment", "cannot allocate memory")
 
@@ -30,7 +33,7 @@ def require() -> None:
 
 
 def describe_failure(error: ImportError) -> str:
-    """A one-line message if a library failed to load for lack of address space; "" for any other reason."""
+    """Return a one-line message if a library could not be loaded for lack of address space, otherwise ""."""
     return f"{_line()} ({error})" if any(sign in str(error).lower() for sign in _SIGNS) else ""
 
 

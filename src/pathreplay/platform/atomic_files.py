@@ -18,7 +18,7 @@ from pathreplay.platform.interrupts import undisturbed
 
 Chunk: TypeAlias = "bytes | memoryview"
 Content: TypeAlias = "bytes | Callable[[], Iterable[Chunk]]"
-"""Content of a file: bytes, or a function that yields them in chunks when called."""
+"""Content of a file: bytes, or a function that returns the bytes in chunks."""
 
 
 def chunks(content: Content) -> Iterable[Chunk]:
@@ -27,14 +27,14 @@ def chunks(content: Content) -> Iterable[Chunk]:
 
 
 def made(make: Callable[..., bytes], *arguments: object) -> Content:
-    """Content that ``make(*arguments)`` computes when the file is written, not before."""
+    """Return content that ``make(*arguments)`` computes only when the file is written."""
     return lambda: (make(*arguments),)
 
 
 def require_writable(path: Path, option: str) -> None:
     """Raise PathreplayError if no file can be written at ``path``.
 
-    Reasons: it is a folder or a device, its folder does not exist, or permissions are missing.
+    Possible reasons: the path is a folder or a device, its folder does not exist, or permissions are missing.
     """
     problem = file_problem(path)
     if problem.startswith(("is ", "cannot be reached")):
@@ -46,9 +46,9 @@ def require_writable(path: Path, option: str) -> None:
 
 
 def write_whole(path: Path, data: bytes, option: str) -> None:
-    """Write the file atomically, replacing an existing one.
+    """Write a file atomically, and replace an existing file.
 
-    Raises PathreplayError if that fails, and leaves nothing behind.
+    Raises PathreplayError if the file cannot be written, and leaves no partial file behind.
     """
     part = None
     try:
@@ -71,9 +71,9 @@ def write_whole(path: Path, data: bytes, option: str) -> None:
 
 @contextmanager
 def whole_folder(path: Path, option: str) -> Iterator[Path]:
-    """A folder to fill, which becomes ``path`` at the end of the block, and is removed where the block raises.
+    """Yield a temporary folder, which is renamed to ``path`` at the end of the block, or removed if the block raises.
 
-    Raises PathreplayError where ``path`` exists already (an empty folder may), or cannot be written.
+    Raises PathreplayError if ``path`` exists and is not an empty folder, or cannot be written.
     """
     if os.path.lexists(path) and not (path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
         raise PathreplayError(f"{path} exists already; give {option} a new folder")
@@ -94,7 +94,10 @@ def whole_folder(path: Path, option: str) -> Iterator[Path]:
 
 
 def _umask() -> int:
-    """The process's umask: temporary files are created without permissions for others, so it is applied by hand."""
+    """Return the umask of this process, from which callers compute the usual permissions of a new file or folder.
+
+    Temporary files are created without permissions for other users.
+    """
     mask = os.umask(0)
     os.umask(mask)
     return mask

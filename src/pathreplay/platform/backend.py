@@ -1,9 +1,9 @@
-"""Point Dr.Jit to a working libLLVM, and select a variant of Mitsuba on request.
+"""Makes Dr.Jit load a working libLLVM, and sets the variant of Mitsuba.
 
-Dr.Jit searches libLLVM once, when `drjit` is imported: it loads the file named by DRJIT_LIBLLVM_PATH, otherwise the
-newest one in a few folders. The variable must therefore be correct before that, and `import pathreplay` calls
-`point_drjit` first. It does not test the library, because pip's library is known to work. Tests in a subprocess
-(pathreplay.platform.llvm) are left to `set_variant` and the doctor.
+Dr.Jit searches for libLLVM once, when `drjit` is imported. It loads the file named by DRJIT_LIBLLVM_PATH, or else the
+newest libLLVM in a few folders. The variable must therefore be set before the import, and `import pathreplay` calls
+`point_drjit` first. `point_drjit` tests no library, because pip's library is known to work. `set_variant` and the
+doctor test libraries in a subprocess (pathreplay.platform.llvm).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ logger = logging.getLogger("pathreplay")
 def point_drjit() -> None:
     """Make Dr.Jit load a working libLLVM, without testing it. Raises nothing.
 
-    Before drjit is imported: unless DRJIT_LIBLLVM_PATH names a loadable file, set it to pip's library, otherwise to the
-    newest system library that is not known to fail. After drjit is imported: replace a loaded library that is known to
-    fail.
+    If drjit is not imported yet, DRJIT_LIBLLVM_PATH is set to pip's library, or else to the newest system library that
+    is not known to fail. A value that names a loadable library is kept. If drjit is already imported, a loaded library
+    that is known to fail is replaced.
     """
     if "drjit" in sys.modules:
         path = None if loaded_is_plausible() else _untried_choice()
@@ -43,7 +43,7 @@ def point_drjit() -> None:
 
 
 def _known_problem(path: str) -> str:
-    """The known defect of a libLLVM, found without a test: too old by its file name, or not loadable."""
+    """Return why a libLLVM cannot work, without a test: its version is too old, or it cannot be loaded; else ""."""
     version = llvm.version_in_path(os.path.realpath(path))
     if version and version < (OLDEST_USABLE_MAJOR,):
         return f"LLVM {version[0]} is refused by Dr.Jit or aborts the process"
@@ -84,11 +84,11 @@ def loaded_is_plausible() -> bool:
 
 
 def reload_llvm(path: str) -> bool:
-    """Make an imported Dr.Jit release its libLLVM and load `path`; return False if that is impossible.
+    """Make an imported Dr.Jit release its libLLVM and load `path`; return False if this is impossible.
 
-    It is impossible while Dr.Jit holds variables or a CUDA device, which would be lost, and where Dr.Jit found no
-    loadable file at all, because it does not search a second time. Uses two functions of libdrjit-core without Python
-    bindings (`jit_shutdown`, `jit_init`).
+    Replacing is impossible while Dr.Jit holds variables or a CUDA device, which would be lost. Replacing is also
+    impossible if Dr.Jit found no loadable file at all, because Dr.Jit does not search a second time. The function calls
+    `jit_shutdown` and `jit_init` of libdrjit-core, which have no Python bindings.
     """
     import drjit as dr
 
@@ -126,9 +126,9 @@ def warn_of_bad_llvm() -> None:
 def ensure_llvm() -> None:
     """Ensure that Dr.Jit's LLVM back end works in this process.
 
-    Pip's library is trusted once it is loaded. Any other library is tested (0.3 s), and replaced if the test fails.
+    Pip's library is not tested once it is loaded. Any other library is tested (0.3 s), and replaced if the test fails.
 
-    Raises PathreplayError if no library works, or if the loaded one can no longer be replaced.
+    Raises PathreplayError if no library works, or if the loaded library can no longer be replaced.
     """
     current = os.environ.get(ENVIRONMENT_VARIABLE, "")
     plausible = loaded_is_plausible()
@@ -155,10 +155,11 @@ def is_usable_variant(name: str) -> bool:
 def set_variant(name: str | None = None) -> str:
     """Set a Mitsuba variant that runs on this machine, and return its name.
 
-    Without a name, an active variant with automatic differentiation is kept. Otherwise CUDA is used if there is a
-    device (`cuda_ad_rgb`), and LLVM if not (`llvm_ad_rgb`).
+    Without a name, an active variant with automatic differentiation is kept. If there is none, the variant is
+    `cuda_ad_rgb` on a machine with a CUDA device, and `llvm_ad_rgb` elsewhere.
 
-    Raises PathreplayError for a name that does not exist, has no derivatives or is polarised, and if no variant runs.
+    Raises PathreplayError if the named variant does not exist, has no derivatives or is polarised, or if it does not
+    run on this machine.
     """
     try:
         import drjit as dr

@@ -1,11 +1,12 @@
-"""The device that runs kernels, and what depends on it: local memory per lane, total memory, order of additions.
+"""The device that runs kernels: local memory per lane, total memory, and order of additions.
 
-On LLVM as many lanes run at once as the threads' vector packets hold, and local memory is part of each thread's stack.
-A GPU reserves local memory for every thread that can be resident, whatever the launch size: records of 124 bytes at
-depth 2048, for 2048 threads on each of 132 multiprocessors, take 69 GB. Deep records are therefore for CPUs only.
+On LLVM, the lanes of one vector packet per thread run at the same time, and local memory is part of each thread's
+stack. A GPU reserves local memory for every thread that can be resident, whatever the launch size. For example, 2048
+path records of 124 bytes, for 2048 threads on each of 132 multiprocessors, take 69 GB. Records of long paths are
+therefore for CPUs only.
 
-The statements about GPUs were measured on an H100 (docs/memory.md) and are tested with simulated devices. On other GPUs
-`pathreplay doctor --gpu` measures them.
+The figures for GPUs were measured on an H100 (docs/memory.md) and are tested with simulated devices. `pathreplay doctor
+--gpu` measures them on other GPUs.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from pathreplay.platform import memory
 SHARE = 0.25
 """Fraction of GPU memory that records may take; the rest is for the scene, the film and other processes."""
 LARGEST_LOCAL = 56 * 1024
-"""Largest number of bytes of local memory per CUDA thread. OptiX provides a stack of 64 KiB and crashes the process if
-it overflows. A record of 560 x 96 bytes fits; one of 700 x 96 does not."""
+"""Largest number of bytes of local memory per CUDA thread. OptiX provides a stack of 64 KiB, and crashes the process if
+the stack overflows. A record of 560 x 96 bytes fits; a record of 700 x 96 bytes does not."""
 FEWEST_RECORDS = 9
 """Smallest number of records allocated on a GPU. Arrays of up to eight entries are kept in registers, where dynamic
 indexing makes a pass more than twice as slow."""
@@ -53,19 +54,19 @@ class Device:
         return not self.is_gpu
 
     def local_bytes(self) -> int | None:
-        """Bytes of local memory that a lane may use; None: no limit besides those of the drivers."""
+        """Return the bytes of local memory that a lane may use; None on CPUs, where only the caller's limits apply."""
         if not self.is_gpu:
             return None
         known = self.lanes > 0 and self.memory > 0
         return min(LARGEST_LOCAL, int(SHARE * self.memory) // self.lanes) if known else LARGEST_LOCAL
 
     def most_records(self, size: int, otherwise: int) -> int:
-        """Largest number of records of ``size`` bytes per lane, up to ``otherwise``."""
+        """Return the largest number of records of ``size`` bytes per lane, at most ``otherwise``."""
         room = self.local_bytes()
         return otherwise if room is None else min(otherwise, room // size)
 
     def room(self, records: int) -> int:
-        """Number of records to allocate if ``records`` are needed."""
+        """Return the number of records to allocate if ``records`` are needed."""
         return max(records, FEWEST_RECORDS) if self.is_gpu else records
 
 
@@ -75,7 +76,7 @@ def backend_of(variant: str) -> str:
 
 
 def device_of(variant: str) -> Device:
-    """The device that a Mitsuba variant runs on; a GPU that cannot be queried is treated as unlimited."""
+    """Return the device that a Mitsuba variant runs on; lanes and memory of a GPU that cannot be queried are 0."""
     kind = backend_of(variant)
     return _cuda_device() if kind == "cuda" else Device(kind)
 
@@ -103,7 +104,7 @@ def _cuda_device() -> Device:
 
 
 def available(variant: str) -> int:
-    """Bytes available to renderings: the free memory of the machine, and on a GPU at most the device's memory."""
+    """Return the bytes available for rendering: the machine's free memory, on a GPU at most the device's memory."""
     device, left = device_of(variant), memory.available()
     return min(left, device.memory) if device.memory else left
 

@@ -1,4 +1,4 @@
-"""Checks of user files before they are opened, because pipes and devices block, and safe names for our own files."""
+"""Checks of user files before they are opened (pipes and devices would block), and safe names for output files."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _KINDS = {
 
 
 def file_problem(path: str | Path, most_bytes: int | None = None) -> str:
-    """Why ``path`` cannot be read as a file, as the predicate of an error message; "" if it can.
+    """Return why ``path`` cannot be read as a file, as the predicate of an error message, or "".
 
-    Follows symbolic links. ``most_bytes`` is the size above which the file cannot be of the expected kind.
+    Symbolic links are followed. A file of more than ``most_bytes`` is too large to be of the expected kind.
     """
     try:
         status = os.stat(path)
@@ -41,15 +41,15 @@ def file_problem(path: str | Path, most_bytes: int | None = None) -> str:
     return ""
 
 
-# Bytes. File systems allow 255 in total; prefixes, a suffix and the mark of an unfinished file are added to this.
+# Bytes. File systems allow 255; the difference leaves room for a prefix, a suffix and the mark of an unfinished file.
 LONGEST = 150
 
 
 def file_names(names: Iterable[str]) -> dict[str, str]:
-    """A file name (without suffix) for each name; all are distinct, even if case is ignored.
+    """Return a file name (without suffix) for each name; the file names differ even if case is ignored.
 
-    Letters, digits, ``_``, ``.`` and ``-`` stay; other characters become ``_``. Long names are truncated. Where two
-    names would collide, or one was truncated, a short hash of the name is appended.
+    Letters, digits, ``_``, ``.`` and ``-`` stay; other characters become ``_``. Long names are truncated. A short hash
+    of the name is appended to a file name that was truncated or would collide with another.
     """
     safe = {name: re.sub(r"[^\w.-]", "_", name) for name in names}
     # Some file systems ignore case, hence casefold.

@@ -14,14 +14,14 @@ from pathreplay.errors import PathreplayError
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Signals within this interval count as one request: the second must not interrupt what the first one started.
+# Seconds. Signals within this interval count as one: a second signal must not interrupt the reaction to the first.
 ONE_WISH_S = 1.0
 
 _raised_at: list[float] = []  # time at which a signal handler last raised an exception
 
 
 def raise_once(error: BaseException) -> None:
-    """Raise ``error``, unless a signal handler raised an exception a moment ago that is still propagating."""
+    """Raise ``error``, unless a signal handler has just raised an exception, which may still be propagating."""
     now = time.monotonic()
     if _raised_at and now - _raised_at[-1] < ONE_WISH_S:
         return
@@ -38,7 +38,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def name_of(number: int) -> str:
-    """The signal's name for users."""
+    """Return the name of a signal for messages to the user."""
     return "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
 
 
@@ -46,7 +46,7 @@ def name_of(number: int) -> str:
 def handled(
     handle: Callable[[int, FrameType | None], object], keep: Callable[[], bool] = lambda: False
 ) -> Iterator[None]:
-    """Within this block ``handle`` receives the signals in `ENDING`, if this is the main thread.
+    """Handle the signals in `ENDING` by ``handle`` within this block, if this is the main thread.
 
     SIGTERM and SIGHUP stay ignored if the parent process ignores them (nohup). The previous handlers are restored at
     the end, unless ``keep`` returns True because the process is about to exit.
@@ -68,9 +68,9 @@ def handled(
 
 @contextmanager
 def raised() -> Iterator[None]:
-    """Make each signal raise `Interrupted` while a command runs, even if a library converts the exception.
+    """Make each signal raise `Interrupted` within this block, even if a library converts the exception.
 
-    Once a signal has arrived, the handlers stay in place, so that nothing disturbs the end of the process.
+    After a signal, the handlers stay in place until the process ends, so that further signals cannot kill it.
     """
     numbers: list[int] = []
 
@@ -89,7 +89,7 @@ def raised() -> Iterator[None]:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Defer signals to the end of this short block, also if it ends with an exception; each is then raised again."""
+    """Defer signals until this short block ends, normally or by an exception, and then raise each signal again."""
     late: list[int] = []
     try:
         with handled(lambda number, frame: late.append(number)):
@@ -104,17 +104,24 @@ class Stop:
     """A request to end a run after the current iteration."""
 
     by: str | None = None
-    """Source of the request: 'Ctrl-C', 'SIGTERM' or 'SIGHUP'; None without a request."""
+    """Source of the request, such as 'Ctrl-C', 'SIGTERM', 'the stop button' or 'a callback'; None without a request."""
     aborted: bool = False
+    """Whether a second Ctrl-C has aborted the run."""
 
 
 @contextmanager
 def stopping(say: Callable[[str], None], remedy: str, stop: Stop | None = None) -> Iterator[Stop]:
-    """Within this block the first signal requests a stop, and a second one that is Ctrl-C raises KeyboardInterrupt.
+    """Request a stop at the first signal within this block, and raise KeyboardInterrupt at a later Ctrl-C.
 
     SIGTERM and SIGHUP only request a stop, however often they arrive: schedulers and terminals send them repeatedly.
-    ``say`` receives status messages; ``remedy`` is the message of the KeyboardInterrupt; ``stop`` is the request to
-    set, if the caller has one already.
+
+    Args:
+        say: receives status messages.
+        remedy: message of the KeyboardInterrupt.
+        stop: the request to set; default: a new one.
+
+    Yields:
+        The request.
     """
     stop = Stop() if stop is None else stop
 

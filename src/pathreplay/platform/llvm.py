@@ -1,9 +1,9 @@
-"""Find a libLLVM that works with Dr.Jit.
+"""Finds a libLLVM that works with Dr.Jit.
 
-Dr.Jit 1.5 rejects LLVM 14 and older. It accepts 15 and 16, which then abort the process at the first minimum or maximum
-because they cannot select these instructions for x86. Testing a library in this process is too dangerous, so candidates
-are tested in subprocesses (0.2-0.3 s each). Their order: DRJIT_LIBLLVM_PATH, the library installed by `pip install
-pathreplay` (karellen-llvm-core), the system's libraries from new to old.
+Dr.Jit 1.5 rejects LLVM 14 and older. It accepts 15 and 16, which abort the process at the first minimum or maximum
+because they cannot select these instructions for x86. Candidates are therefore tested in subprocesses (0.2-0.3 s each),
+in this order: DRJIT_LIBLLVM_PATH, the library that `pip install pathreplay` installs (karellen-llvm-core), and the
+system's libraries from new to old.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pathlib import Path
 from pathreplay.errors import PathreplayError
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
-#: The user's value, before `import pathreplay` sets the variable or replaces a value that cannot work.
+#: The user's value of the variable. `import pathreplay` may set the variable, or replace a value that cannot work.
 ASKED_FOR = os.environ.get(ENVIRONMENT_VARIABLE, "")
 PIP_DISTRIBUTION = "karellen-llvm-core"
 OLDEST_USABLE_MAJOR = 17
@@ -42,8 +42,8 @@ WAY_OUT = (
 class LlvmLibrary:
     """A libLLVM and the result of its test.
 
-    `version` is the version that the library reports ("23.1.4"), or that of its file name if it crashed before; "" if
-    neither is known. `message` is empty if the library works, otherwise a one-line reason.
+    `version` is the version that the library reports, such as "23.1.4". If the library crashed before, `version` is
+    taken from its file name, and may be "". `message` is "" if the library works, otherwise a one-line reason.
     """
 
     path: str
@@ -54,17 +54,16 @@ class LlvmLibrary:
 
 
 def pip_library() -> str | None:
-    """Path of the libLLVM that the wheel karellen-llvm-core installed; None without it.
+    """Return the path of the libLLVM that the wheel karellen-llvm-core installed; None without the wheel.
 
-    The path comes from the wheel's own list of files, which is correct in virtual environments and user installs alike.
-    (`pip install --target` omits the wheel's lib folder, so that nothing is found.)
+    The path comes from the wheel's list of files, which is correct in virtual environments and user installs. `pip
+    install --target` omits the wheel's lib folder, in which case the result is None.
     """
     try:
         files = importlib.metadata.files(PIP_DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:
         return None
-    # Use the file itself, not its symbolic links: these are created only at the first start of Python after
-    # installation.
+    # Use the file instead of its links, which are created only at the first start of Python after installation.
     paths = (Path(str(f.locate())).resolve() for f in files if re.fullmatch(r"libLLVM\.so\.[\d.]+", f.name))
     return next((str(path) for path in paths if path.is_file()), None)
 
@@ -91,10 +90,10 @@ _SYSTEM_PATTERNS = {
 
 
 def version_in_path(path: str) -> tuple[int, ...]:
-    """The LLVM version in a path, as a tuple; empty if it contains none.
+    """Return the LLVM version in a path as a tuple, which is empty if the path contains no version.
 
-    libLLVM.so.19.1 -> (19, 1); libLLVM-15.so.1 -> (15,); .../llvm@20/20.1.8/lib/libLLVM.dylib -> (20, 1, 8). A single
-    digit after .so is the version of the interface, not of LLVM.
+    Examples: libLLVM.so.19.1 -> (19, 1); libLLVM-15.so.1 -> (15,); .../llvm@20/20.1.8/lib/libLLVM.dylib -> (20, 1, 8).
+    A single digit after .so is the version of the interface, which differs from that of LLVM.
     """
     name = os.path.basename(path)
     for text, pattern in (
@@ -110,7 +109,7 @@ def version_in_path(path: str) -> tuple[int, ...]:
 
 
 def _known_to_linker() -> list[str]:
-    """The libLLVM files listed by ldconfig, which include folders specific to this system."""
+    """Return the libLLVM files that ldconfig lists, which may be in folders specific to this system."""
     for program in ("ldconfig", "/sbin/ldconfig", "/usr/sbin/ldconfig") if sys.platform == "linux" else ():
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             listing = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10).stdout
@@ -126,9 +125,9 @@ def system_libraries() -> list[str]:
 
 
 def candidates() -> Iterator[tuple[str, str]]:
-    """(path, origin) of each libLLVM to test, in order of preference, each file once."""
+    """Yield (path, origin) of each libLLVM to test, in order of preference, each file once."""
     pip = pip_library() or ""
-    # A subprocess inherits the variable that we set; the origin of the library is then still pip.
+    # A subprocess inherits the variable that the parent set to pip's library; the origin of this library is still pip.
     named = ((ASKED_FOR, "pip" if ASKED_FOR == pip else ENVIRONMENT_VARIABLE), (pip, "pip"))
     seen = {""}
     for path, origin in (*named, *((path, "system") for path in system_libraries())):
@@ -138,7 +137,7 @@ def candidates() -> Iterator[tuple[str, str]]:
             yield path, origin
 
 
-#: Start of every test: the parent's sys.path, no core dump (a crash is a valid result), the library's siblings.
+#: Start of every test: set the parent's sys.path, disable core dumps (a crash is a valid result), load libraries.
 _BEGIN = """
 import ctypes, json, sys
 task = json.loads(sys.argv[1])
@@ -169,11 +168,11 @@ if [y[i] for i in range(3)] != [1.5, 4.0, 6.0] or [gradient[i] for i in range(3)
 
 
 def unlinked_siblings(path: str) -> list[str]:
-    """Run-time libraries that the wheel's libLLVM needs but cannot find yet.
+    """Return the run-time libraries that the wheel's libLLVM needs but cannot find yet.
 
-    At the first start of Python after installation the wheel creates the links libc++.so.1 -> libc++.so.1.0 (and two
-    more). Where it could not (a folder without write permission), loading these files first has the same effect,
-    because the loader matches the names stored inside them.
+    At the first start of Python after installation, the wheel creates the links libc++.so.1 -> libc++.so.1.0 and two
+    more. The links are missing if the folder is not writable. Loading the files before libLLVM then has the same
+    effect, because the loader matches the names stored inside them.
     """
     folder = Path(path).parent / "x86_64-unknown-linux-gnu"
     files = [folder / name for name in ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")]
@@ -182,8 +181,8 @@ def unlinked_siblings(path: str) -> list[str]:
 
 
 def _reason(returncode: int, stderr: str) -> str:
-    """A one-line reason for the failure of a test, from the exit status and standard error of the subprocess."""
-    # `probe` disables the kernel cache, which Dr.Jit reports.
+    """Return a one-line reason for the failure of a test, from exit status and standard error of the subprocess."""
+    # Dr.Jit reports that the kernel cache is disabled, which `probe` does on purpose.
     messages = [line.strip() for line in stderr.splitlines() if line.strip() and "kernel cache" not in line]
     lines = [re.sub(r"^\w+\(\): ", "", line) for line in messages] or [""]
     crash = returncode < 0 and returncode != -signal.SIGTERM
@@ -198,9 +197,9 @@ def _reason(returncode: int, stderr: str) -> str:
 
 
 def run_trial(code: str, task: Mapping[str, object], environment: Mapping[str, str]) -> tuple[str, str]:
-    """Run `code` in a Python subprocess in which `task` is defined and its "preload" libraries are loaded.
+    """Run `code` in a Python subprocess that defines `task` and has loaded the libraries in `task["preload"]`.
 
-    Returns the standard output, and a one-line reason if it failed ("" otherwise). Raises nothing.
+    Returns the standard output, and a one-line reason if the subprocess failed ("" otherwise). Raises nothing.
     """
     if not sys.executable:
         return "", "cannot be tested: sys.executable is not set"
@@ -223,7 +222,7 @@ def run_trial(code: str, task: Mapping[str, object], environment: Mapping[str, s
 
 @functools.cache
 def probe(path: str, origin: str = "") -> LlvmLibrary:
-    """Test one libLLVM in a subprocess: minimum, maximum and a gradient are compared with known values.
+    """Test one libLLVM in a subprocess, by comparing minimum, maximum and a gradient with known values.
 
     An empty `path` tests the library that Dr.Jit chooses itself. The result is cached for the lifetime of this process.
     Raises nothing: failures are reported in `works` and `message`.
@@ -236,7 +235,7 @@ def probe(path: str, origin: str = "") -> LlvmLibrary:
 
 
 def find_llvm() -> LlvmLibrary:
-    """The first candidate that works. Raises PathreplayError if none does."""
+    """Return the first candidate that works. Raises PathreplayError if no candidate works."""
     failed = []
     for path, origin in candidates():
         if (library := probe(path, origin)).works:

@@ -1,4 +1,4 @@
-"""Available memory, so that requests that cannot fit are refused before anything is allocated; and memory budgets."""
+"""Available memory and memory budgets, to refuse requests that cannot fit before anything is allocated."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ _CONTAINERS = tuple(
 
 
 def available() -> int:
-    """Bytes that this process can still allocate without swapping, on the machine and in its container, if any."""
+    """Return the bytes that this process can allocate without swapping.
+
+    Limits are the free memory of the machine, the limit of the container, and the budget of `within`.
+    """
     left = int(psutil.virtual_memory().available)
     for limit, used, statistics in _CONTAINERS:
         try:
@@ -42,7 +45,10 @@ _budget: int | None = None
 
 @contextmanager
 def within(budget: int | None) -> Iterator[None]:
-    """Set the process's memory budget within this block: `available` respects it, `require_kept` enforces it."""
+    """Set the memory budget of this process, in bytes, within this block; None: no budget.
+
+    `available` respects the budget, and `require_kept` enforces it.
+    """
     global _budget
     before = _budget
     _budget = budget
@@ -53,7 +59,7 @@ def within(budget: int | None) -> Iterator[None]:
 
 
 def taken() -> int:
-    """Bytes of memory private to this process: file-backed pages, which can be read again, do not count."""
+    """Return the bytes of memory private to this process, without file-backed pages, which can be read again."""
     info = psutil.Process().memory_info()
     return int(info.rss - getattr(info, "shared", 0))
 
@@ -73,7 +79,7 @@ def require_kept() -> None:
 
 
 def require(needed: int, thing: str, remedy: str) -> None:
-    """Raise PathreplayError unless ``needed`` bytes are available; it names ``thing`` and the ``remedy``."""
+    """Raise PathreplayError unless ``needed`` bytes are available; the message names ``thing`` and ``remedy``."""
     if needed > (left := available()):
         asked = f"needs about {_readable(needed)} of memory"
         raise PathreplayError(f"{thing} {asked}, {_readable(left)} is available; {remedy}")

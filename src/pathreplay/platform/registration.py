@@ -1,9 +1,9 @@
-"""Register our plugins for the active variant of Mitsuba and for every variant set later.
+"""Registers our plugins for the active variant of Mitsuba and for every variant set later.
 
-Mitsuba knows a Python plugin only in the variant in which it was registered, and calls a variant callback only for
-variants set after the callback was added. In variants without derivatives, such as scalar ones, stand-ins are
-registered whose error names the variant to use. Polarised variants get the plugins themselves, which report that they
-are unsupported.
+Mitsuba knows a Python plugin only in the variant in which the plugin was registered, and calls a variant callback only
+for variants set after the callback was added. Variants without derivatives, such as scalar ones, get stand-ins, which
+raise an error that names the variant to use. Polarised variants get the plugins, which report that polarisation is not
+supported.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Plugins = Mapping[str, tuple[str, str, str]]
 
 
 def register(variant: str, plugins: Plugins = PLUGINS) -> None:
-    """Register ``plugins`` for the active variant, named ``variant``; stand-ins if it has no derivatives."""
+    """Register ``plugins`` for the active ``variant``, or stand-ins if the variant has no derivatives."""
     import mitsuba as mi
 
     if "_ad_" not in variant:
@@ -49,8 +49,8 @@ def register(variant: str, plugins: Plugins = PLUGINS) -> None:
 
 
 def mitsuba_integrator() -> Any:
-    """Mitsuba's ADIntegrator of the active variant; with its setup of a pass, seeds mean the same as in Mitsuba."""
-    # The module that Mitsuba executes again for every variant. Importing from the public `mitsuba.ad` creates a copy
+    """Return Mitsuba's ADIntegrator of the active variant, whose setup of a pass interprets seeds as Mitsuba does."""
+    # Mitsuba executes this module again for every variant. An import from the public `mitsuba.ad` would create a copy
     # that stays bound to the first variant.
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
@@ -60,8 +60,8 @@ def mitsuba_integrator() -> Any:
 def on_base(template: type, base: type) -> type:
     """Build the class that a template describes, on a base class of Mitsuba.
 
-    Each variant has its own base class. A template exists before all of them and cannot inherit from one; its methods
-    call base methods through the base class.
+    Each variant has its own base class. A template is defined before any base class and cannot inherit from one. Its
+    methods call base methods through the base class.
     """
     parts = [vars(part) for part in reversed(template.__mro__[:-1])]
     body = {name: value for part in parts for name, value in part.items() if name not in ("__dict__", "__weakref__")}

@@ -1,6 +1,6 @@
-"""Write safetensors files in chunks: no tensor is copied, and only one is in memory at a time.
+"""Writes safetensors files in chunks, without copying tensors, and with only one tensor in memory at a time.
 
-The library's own `save` holds the whole file in memory, in addition to two copies of its tensors.
+The library's own `save` needs memory for the whole file and for two copies of its tensors.
 """
 
 from __future__ import annotations
@@ -20,12 +20,15 @@ _KINDS |= {"float16": "F16", "int32": "I32", "uint64": "U64"}
 def safetensors_chunks(
     arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str], room: Mapping[str, int] | None = None
 ) -> Iterator[Chunk]:
-    """The bytes of a safetensors file with these arrays (by name), in chunks.
+    """Yield the bytes of a safetensors file in chunks.
 
-    Each array is accessed twice: see `WhenAsked`. ``room`` maps names to sizes in bytes of tensors at the end of the
-    file, which the caller writes.
+    Args:
+        arrays: arrays by name; each is accessed twice (`WhenAsked` computes arrays on access).
+        metadata: text fields of the header.
+        room: sizes in bytes, by name, of further tensors at the end of the file, which the caller writes.
 
-    Raises PathreplayError for a data type that the format does not support.
+    Raises:
+        PathreplayError: an array has a data type that is not supported.
     """
     header: dict[str, object] = {"__metadata__": dict(metadata)} if metadata else {}
     end = 0

@@ -1,4 +1,4 @@
-"""Change the size of Dr.Jit's thread pool temporarily: two threads for reading files, one for reproducible sums."""
+"""Changes the size of Dr.Jit's thread pool temporarily: two threads to read files, one for reproducible sums."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import drjit as dr
 
 
 def spare_thread() -> AbstractContextManager[None]:
-    """Within this block, in which Mitsuba reads files, the pool has at least two threads.
+    """Use at least two threads within this block, in which Mitsuba reads files.
 
-    Mitsuba 3.9 submits the blocks of an EXR file to the pool and waits for them without helping. A process restricted
-    to a single core (`taskset -c 0`, small containers) gets a pool of one thread, in which nothing executes them.
-    Writing has the same defect; we write without Mitsuba (see `exr_bytes`).
+    Mitsuba 3.9 submits the blocks of an EXR file to the pool, and the submitting thread waits without executing any. A
+    process restricted to a single core (`taskset -c 0`, small containers) has a pool of one thread, which would wait
+    forever. Writing has the same defect; `exr_bytes` writes without Mitsuba.
     """
     return _threads(max(2, dr.thread_count()))
 
 
 def one_thread(wanted: bool) -> AbstractContextManager[None]:
-    """Within this block, if ``wanted``, Dr.Jit computes in a single thread and results are reproducible bit for bit.
+    """If ``wanted``, use a single thread within this block, so that results are reproducible bit by bit.
 
-    Threads add to pixels and gradients atomically, in random order. Mitsuba must not read or write files in this block:
-    see `spare_thread`.
+    Several threads add to pixels and gradients atomically, in random order. Mitsuba must not read or write files in
+    this block; see `spare_thread`.
     """
     return _threads(1 if wanted else dr.thread_count())
 

@@ -1,1 +1,1 @@
-"""Reports: figures and pages of a run, during the run and after its end."""
+"""Reports: figures and web pages about a run, during the run and after its end."""

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 from pathreplay.errors import PathreplayError
 
-# A user's invalid backend or unreadable settings file makes the import fail. Reports need no backend.
+# With these settings, an invalid backend or an unreadable settings file of the user cannot make the import fail.
 _SETTINGS = {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
 
 
@@ -19,7 +19,7 @@ def _import() -> None:
         import matplotlib
     except (ValueError, RuntimeError):
         for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
-            del sys.modules[name]  # partially imported
+            del sys.modules[name]  # remove partially imported modules
         before = {name: os.environ.get(name) for name in _SETTINGS}
         os.environ.update(_SETTINGS)
         try:

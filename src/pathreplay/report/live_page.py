@@ -1,8 +1,8 @@
-"""The live page of a run: its content, preview images, and the file that asks the run to stop.
+"""Writes the live page of a run and its preview images, and reacts to the file that requests a stop.
 
-Everything is in the folder ``previews``: ``page.json`` holds the content of the page, and frames are named
-ITERATION-WHAT-NAME.webp. None of it is needed to resume. A preview that cannot be written or rendered is omitted and
-never ends a run.
+The folder ``previews`` contains the content of the page (``page.json``), images, and film frames with names of the form
+ITERATION-WHAT-NAME.webp. A run can be resumed without these files. A preview that cannot be written or rendered is
+omitted, and never ends a run.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ FOLDER, PAGE, STOP = "previews", "previews/page.json", "stop"
 BUTTON = "the stop button"
 FRAME = re.compile(r"(\d{6,})-((?:view|texture|volume)-.+)\.webp")
 
-# Minimum seconds between two updates of the page, and minimum ratio of that pause to the time of writing one.
+# Minimum seconds between two updates of the page, and minimum ratio of this pause to the duration of an update.
 PAUSE_S, PAUSE = 1.0, 100
-# Pixels along the longer side of comparison images and of frames.
+# Largest number of pixels along a side of images on the page, and of film frames.
 LARGEST, FRAME_SIDE = 1024, 384
-# Size limit of all frames in a report: enough for a film per image, and small for a page.
+# Size limit of all frames in a report, in bytes. It suffices for a film of each image, and keeps the page small.
 MOST_FILM_BYTES = 2_000_000
 
 PAGES = TypeAdapter(Page)
 
 
 class Previews:
-    """Observes a run: updates its page, and triggers ``stop`` when the file `STOP` appears in its folder."""
+    """Observer that updates the page of a run, and sets ``stop`` when the file `STOP` appears in the run folder."""
 
     def __init__(
         self, folder: RunFolder, config: Config, problem: Problem, run: Run, before: Mapping[str, Image], stop: Stop
@@ -70,12 +70,12 @@ class Previews:
         self._pause = PAUSE_S
         self._resumed, self._stride = 0, 1.0
         self._kept = [0]
-        self._stale = (folder.path / STOP).exists()  # a stop request for an earlier part of the run
+        self._stale = (folder.path / STOP).exists()  # a stop request that was meant for an earlier part of the run
         self._log: list[str] = list(problem.notes)
         self._notes = Notes()
 
     def observe(self, event: Event) -> None:
-        """Update the page. Raises only what ends the process."""
+        """Update the page after an event. Errors of rendering and writing do not end the run."""
         if note := self._notes.of(event):
             self._log.append(note)
         if isinstance(event, Started):
@@ -101,7 +101,10 @@ class Previews:
         self.folder.discard([STOP])
 
     def finished(self, after: Mapping[str, Image]) -> dict[str, tuple[Still, ...]]:
-        """Films for the report by view-NAME, texture-NAME and volume-NAME; the last frames show the results."""
+        """Return the films for the report by subject; their last frames show the results.
+
+        Subjects are view-NAME, texture-NAME and volume-NAME. ``after`` are the resulting images by view name.
+        """
         if self.pictures.share:
             with contextlib.suppress(PathreplayError):
                 shown = {name: after[name] for name in self.pictures.before}
@@ -119,7 +122,10 @@ class Previews:
             self._write({})
 
     def _dropped_frames(self, done: int) -> set[int]:
-        """Iterations whose frames are removed: the latest frame stays, earlier ones are thinned to even distances."""
+        """Record frames after ``done`` iterations; return the iterations whose frames must be removed.
+
+        The first and the latest frames stay. The others are thinned to about equal distances.
+        """
         kept = self._kept
         dropped = {kept.pop()} if len(kept) > 1 and kept[-1] - kept[-2] < self._stride else set()
         kept.append(done)
@@ -134,7 +140,7 @@ class Previews:
         self.folder.discard(names)
 
     def _render_previews(self, done: int) -> dict[str, bytes]:
-        """Render the views with the current values; returns preview files by name."""
+        """Render the views with the current values, and return the preview files by name."""
         images = self.pictures.look(done)
         if self.pictures.why_none:
             self._log.append(f"no more previews: {self.pictures.why_none}")
@@ -142,7 +148,7 @@ class Previews:
         return self._frames(done, images) | self._of_views("result", "difference")
 
     def _of_views(self, *kinds: str) -> dict[str, bytes]:
-        """Files of the images of these kinds; default: all kinds."""
+        """Return the image files of all views by name, for these kinds of images (default: all kinds)."""
         files, shown = {}, self.pictures
         for view in shown.views:
             for kind, image in shown.now[view.name].pictures().items():
@@ -152,7 +158,7 @@ class Previews:
         return files
 
     def _begun(self) -> dict[str, bytes]:
-        """Files of the images that never change, and of the initial values as the first previews."""
+        """Return the first image files by name: all images of the views, and initial values and truths of grids."""
         files = self._of_views()
         for item in recovered_of(self.problem, self.run):
             for kind, image in _grids(item).items():
@@ -173,9 +179,9 @@ class Previews:
         }
 
     def _continued(self) -> None:
-        """Clean up after an earlier part of the run; called after the first step, when resuming has succeeded.
+        """Clean up files of an earlier part of the run. Called after the first step, when resuming has succeeded.
 
-        A killed run may have written frames beyond its checkpoint, which do not belong to this run.
+        A killed run may have written frames after its last checkpoint. These do not belong to the resumed run.
         """
         self._remove_frames(lambda iteration: iteration > self._resumed)
         self._kept = sorted({0, *(iteration for iteration, _, _ in frames(self.folder.path))})
@@ -185,9 +191,9 @@ class Previews:
             self._write(self._begun())
 
     def _write(self, files: Mapping[str, bytes], dropped: Collection[int] = ()) -> None:
-        """Write images and page, then remove the frames of the ``dropped`` iterations."""
+        """Write images, remove the frames of the ``dropped`` iterations, and write the page."""
         begin = time.perf_counter()
-        with contextlib.suppress(PathreplayError):  # if the disk is full, the next checkpoint ends the run
+        with contextlib.suppress(PathreplayError):  # if the disk is full, the next checkpoint reports the error
             if files:
                 self.folder.write(files)
             if dropped:
@@ -257,7 +263,7 @@ class Previews:
 
 
 def _grids(item: Recovered) -> dict[str, Image]:
-    """Initial value and truth of a texture or a volume, if known."""
+    """Return initial value and truth (if known) of a texture or volume as images; empty for other parameters."""
     return {kind: image for kind, image in (item.textures() or item.volumes()).items() if kind in ("start", "truth")}
 
 
@@ -266,13 +272,16 @@ def _address(kind: str, item: Recovered) -> str:
 
 
 def frames(run: Path) -> Iterator[tuple[int, str, Path]]:
-    """Iteration, subject and file of each frame in a run folder, in order."""
+    """Yield iteration, subject and file of each film frame in a run folder, in order of the iterations."""
     matches = [(FRAME.fullmatch(path.name), path) for path in (run / FOLDER).glob("*.webp") if not path.is_symlink()]
     yield from sorted((int(match[1]), match[2], path) for match, path in matches if match)
 
 
 def films(run: Path, most_bytes: int | None = None) -> dict[str, tuple[Still, ...]]:
-    """The frames of a run by subject: data URIs thinned to ``most_bytes``, or relative addresses without a limit."""
+    """Return the film frames of a run by subject.
+
+    With ``most_bytes``, frames are data URIs, thinned to this total size. Otherwise, they are relative addresses.
+    """
     stills_of: dict[str, list[tuple[int, Path]]] = {}
     for iteration, what, path in frames(run):
         stills_of.setdefault(what, []).append((iteration, path))

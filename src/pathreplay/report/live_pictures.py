@@ -24,16 +24,19 @@ from pathreplay.report.page_parts import common_exposure, uri
 from pathreplay.report.pages import page as pages
 from pathreplay.report.pages.page import Picture
 
-# Longer side of the images in a notebook, in pixels.
+# Largest side of the images in a notebook, in pixels.
 SMALL_SIDE = 192
-# Minimum of samples per pixel, if ``eval_spp`` is as large.
+# Minimum number of samples per pixel, unless ``eval_spp`` is smaller.
 LEAST_SPP = 16
 
 CAPTIONS = {"target": "target", "result": "now", "difference": f"difference ×{DIFFERENCE_GAIN:g}"}
 
 
 class LivePictures:
-    """Latest images of the selected views; ``before`` are those at the initial values (default: rendered now)."""
+    """Latest images of some views of a run.
+
+    ``before`` are the images at the initial values by view name; by default, they are rendered now.
+    """
 
     def __init__(self, problem: Problem, run: Run, stop: Stop, before: Mapping[str, Image] | None = None) -> None:
         self._problem, self._run, self._stop = problem, run, stop
@@ -55,10 +58,10 @@ class LivePictures:
             name: Likeness.of(it.result, it.target, it.exposure, it.weight) for name, it in self.now.items()
         }
         self.shown_at = done
-        """Number of iterations at the latest images."""
+        """Number of completed iterations at the latest images."""
 
     def observe(self, event: Event) -> None:
-        """Render images when they are due. For runs without a live page."""
+        """Render images if they are due. Only for runs without a live page: `Previews` calls the other methods."""
         if isinstance(event, Stepped) and self.is_due(event.entry.seconds):
             begin = time.perf_counter()
             with self._problem.computing():
@@ -66,18 +69,21 @@ class LivePictures:
             self.paid(time.perf_counter() - begin)
 
     def is_due(self, seconds: float) -> bool:
-        """Return whether images are due, after an iteration that took so many seconds."""
-        # Before the first images, their cost is estimated by that of an iteration, which is larger.
+        """Return whether images are due after an iteration that took ``seconds``."""
+        # The cost of the first images is unknown, and is estimated by the cost of an iteration, which is larger.
         allowed = self.share * (time.perf_counter() - self._began)
         return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
 
     def paid(self, seconds: float) -> None:
-        """Account for the time of the latest images."""
+        """Record the time that the latest images took."""
         self._cost = seconds
         self.spent += seconds
 
     def look(self, done: int) -> dict[str, Image]:
-        """Render images after so many iterations. If that fails, return none, and render no more."""
+        """Render images after ``done`` iterations, and return them by view name.
+
+        If Mitsuba fails, no more images are rendered, and the result is empty.
+        """
         try:
             images = self._rendered()
         except RuntimeError as error:
@@ -96,7 +102,7 @@ class LivePictures:
         return {view.name: picture_of(self._problem, values, view, spp) for view in self.views}
 
     def small(self) -> tuple[pages.View, ...]:
-        """Return target, current image and difference of the views as thumbnails in data URIs."""
+        """Return target, current image and difference of each view as thumbnails (data URIs)."""
         found = []
         for view in self.views:
             shown, stored = self.now[view.name].pictures(), self.stored(view)
@@ -110,7 +116,7 @@ class LivePictures:
         return tuple(entry.loss for entry in self._run.history)
 
     def stored(self, view: View) -> float:
-        """Return the exposure of encoded images of the view."""
+        """Return the exposure at which images of a view are encoded."""
         return min(self.exposure, exposure_for(view.target))
 
 
@@ -133,8 +139,8 @@ def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
 
 
 def encoded_picture(image: Image, exposure: float, side: int, kind: str) -> bytes:
-    """Encode a tone-mapped image of at most ``side`` x ``side`` pixels, as PNG or lossy WebP."""
-    # Downscale first: a large texture in double precision would need more memory than everything else about it.
+    """Tone-map an image, reduce it to at most ``side`` x ``side`` pixels, and encode it as PNG or lossy WebP."""
+    # Downscale first: in double precision, a large texture would need more memory than all its other copies.
     pixels = np.round(255 * displayed(grids.shown(image, 2 * side), exposure)).astype(np.uint8)
     picture = PIL.Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
     if max(picture.size) > side:

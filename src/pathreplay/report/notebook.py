@@ -1,4 +1,4 @@
-"""What the user sees in a notebook while a job runs: one output that is drawn anew, instead of lines."""
+"""The progress display in a notebook: a single output that is updated while a job runs."""
 
 from __future__ import annotations
 
@@ -14,19 +14,22 @@ from pathreplay.report.pages.page import View
 from pathreplay.report.pages.panel import Panel
 from pathreplay.report.progress import Progress
 
-# Between two states of the output: each is sent to the browser as a whole.
+# Minimum seconds between two updates, because each update sends the whole output to the browser.
 PAUSE_S = 1.0
 MOST_NOTES = 8
 
 
 def in_notebook() -> bool:
-    """Whether this Python is the kernel of a notebook, which shows HTML, and not a terminal."""
+    """Return whether this process is the kernel of a notebook, which can show HTML."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None
 
 
 class NotebookPanel:
-    """The same as `Progress`, in a notebook; use as a context manager, which ends with the last state on show."""
+    """Shows the progress of a job in a notebook, with the interface of `Progress`.
+
+    It is a context manager; the last state stays visible after the block.
+    """
 
     def __init__(self) -> None:
         from IPython.display import HTML, display
@@ -48,29 +51,29 @@ class NotebookPanel:
         self._draw()
 
     def follow(self, pictures: LivePictures, title: str) -> None:
-        """Show the pictures and losses of a run from now on."""
+        """Show the images and losses of a run from now on."""
         self._pictures, self._title = pictures, title
 
     def say(self, text: str) -> None:
-        """Name what is going on now."""
+        """Show the current phase of the job."""
         self._status = text
         self._draw()
 
     def status(self, text: str) -> None:
-        """What is so for a moment."""
+        """Show a transient status at the next update."""
         self._status = f"optimizing: {text}"
 
     def remark(self, text: str) -> None:
-        """One line that stays, for who looks on."""
+        """Add a permanent line; see `note`."""
         self.note(text)
 
     def note(self, text: str) -> None:
-        """One line that stays, while there are few."""
+        """Add a permanent line. Only the last `MOST_NOTES` lines are shown."""
         self._lines = [*self._lines, plain_line(text)][-MOST_NOTES:]
         self._draw()
 
     def observe(self, event: Event) -> None:
-        """Show what the run tells."""
+        """Show an event of the run."""
         if isinstance(event, Started):
             self._begin, self._before, self._wanted = time.monotonic(), event.done, event.wanted
             self.say("optimizing")
@@ -81,7 +84,7 @@ class NotebookPanel:
             self.note(note)
 
     def _draw(self) -> None:
-        with contextlib.suppress(OSError, RuntimeError):  # nobody is there to see it, or a signal came in between
+        with contextlib.suppress(OSError, RuntimeError):  # the front end is gone, or a signal interrupted the output
             self._handle.update(self._html(self._panel().html()))
         self._told = time.monotonic()
 
@@ -108,5 +111,5 @@ class NotebookPanel:
 
 
 def progress_of(shown: bool) -> Progress | NotebookPanel:
-    """Create the progress display: a panel in a notebook, a bar or lines elsewhere, nothing unless ``shown``."""
+    """Create the progress display: a panel in a notebook, otherwise a bar or lines. Without ``shown``, it is silent."""
     return NotebookPanel() if shown and in_notebook() else Progress(shown)

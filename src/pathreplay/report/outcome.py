@@ -1,4 +1,4 @@
-"""The outcome of a run in numbers and images: the data behind the report, the result files and `RunResult`."""
+"""The outcome of a run in numbers and images, from which the report, the result files and `RunResult` are made."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ from pathreplay.inverse.parameters.values import Array
 from pathreplay.runs.run_folder import resume_command
 from pathreplay.types import Json
 
-# Gain of difference images, which would be black after convergence otherwise.
+# Factor of difference images, which would otherwise be black after convergence.
 DIFFERENCE_GAIN = 4.0
 _KINDS = "target", "start", "result", "difference"
 
 
 @dataclass(frozen=True)
 class ViewPictures:
-    """Images of one view (linear): target, initial, result and the baseline's result, and their display exposure."""
+    """Linear images of one view: target, image at the initial values, result, and result of the baseline.
+
+    ``exposure`` is the factor with which the images are displayed.
+    """
 
     name: str
     target: Image
@@ -38,19 +41,19 @@ class ViewPictures:
     exposure: float
     baseline: Image | None = None
     weight: Image | None = None
-    """Weight per pixel, if not uniform."""
+    """Weight per pixel; None if all weights are equal."""
     is_test: bool = False
     factors: tuple[float, ...] = ()
-    """Recovered exposure by which the result is multiplied: one factor, or one per colour channel."""
+    """Recovered exposure: factors by which the result is multiplied, one for all or one per colour channel."""
 
     def error(self, image: Image) -> float:
-        """Weighted root mean square difference from the target."""
+        """Return the weighted root mean square difference of an image from the target."""
         squares = np.square(image.astype(np.float64) - self.target)
         return float(np.sqrt(np.mean(squares if self.weight is None else squares * self.weight)))
 
     @cached_property
     def likenesses(self) -> dict[str, Likeness]:
-        """Image metrics of 'start', 'result' and 'baseline' if any, weighted, at the view's exposure."""
+        """Weighted image metrics of 'start', 'result' and, if any, 'baseline', at the exposure of the view."""
         images = {"result": self.result, "start": self.start, "baseline": self.baseline}
         return {
             kind: Likeness.of(image, self.target, self.exposure, self.weight, flip=self.is_test)
@@ -59,7 +62,7 @@ class ViewPictures:
         }
 
     def as_dict(self) -> Json:
-        """The view's entry of views.json."""
+        """Return the entry of this view in views.json."""
         table: Json = {"is_test": self.is_test, "exposure": self.exposure}
         if self.factors:
             table["recovered_exposure"] = list(self.factors)
@@ -69,11 +72,14 @@ class ViewPictures:
         return table
 
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of images to show; a difference is DIFFERENCE_GAIN * (result - target), positive red, negative blue."""
+        """Return the kinds of images to show.
+
+        A difference is `DIFFERENCE_GAIN` times (result - target); positive values are red, and negative values blue.
+        """
         return (*_KINDS, *(() if self.baseline is None else ("baseline", "baseline-difference")))
 
     def picture(self, kind: str) -> Image:
-        """The image of a kind."""
+        """Return the image of a kind; see `kinds`."""
         if kind in ("difference", "baseline-difference"):
             image = self.result if kind == "difference" else self.baseline
             assert image is not None
@@ -81,7 +87,7 @@ class ViewPictures:
         return getattr(self, kind)
 
     def pictures(self) -> dict[str, Image]:
-        """All images to show, by kind."""
+        """Return all images to show, by kind."""
         return {kind: self.picture(kind) for kind in self.kinds()}
 
     def _difference(self, image: Image) -> Image:
@@ -91,7 +97,7 @@ class ViewPictures:
 
 @dataclass(frozen=True)
 class Recovered:
-    """One parameter: initial value, result, truth if known, and the baseline's result if any."""
+    """A parameter of a run: initial value, result, true value (if known), and the result of the baseline (if any)."""
 
     key: str
     file_name: str
@@ -101,25 +107,28 @@ class Recovered:
     truth: Array | None
     baseline: Array | None = None
     faces: NDArray[np.integer] | None = None
-    """Vertex indices of the m faces (3 m numbers), if the parameter is the vertices of a mesh."""
+    """Vertex indices of m faces (3m numbers), if the parameter consists of the vertices of a mesh."""
     derived: bool = False
-    """Whether it is computed from other parameters, which are recovered."""
+    """Whether the parameter is computed from other, recovered parameters."""
 
     def known(self, *kinds: str) -> dict[str, Array]:
-        """The values of these kinds that exist: 'start', 'result', 'baseline', 'truth'."""
+        """Return the values that exist among these kinds, which are 'start', 'result', 'baseline' and 'truth'."""
         return {kind: value for kind in kinds if (value := getattr(self, kind)) is not None}
 
     def textures(self) -> dict[str, Image]:
-        """Initial value, result and truth as images (see `shown`); empty unless a texture of one to four channels."""
+        """Return initial value, result and truth as images, reduced by `shown`.
+
+        Empty unless the parameter is a texture (height, width, one to four channels).
+        """
         if self.result.ndim != 3 or self.result.shape[2] > 4:
             return {}
         return {kind: shown(image) for kind, image in self.known("start", "result", "truth").items()}
 
     def volumes(self) -> dict[str, Image]:
-        """Middle slices of initial value, result, baseline's result and truth.
+        """Return the middle slices of initial value, result, baseline's result and truth as images.
 
-        White is the maximum of the truth, or of the result if the truth is unknown. All are shown at the finest
-        resolution among them. Empty unless a volume (z, y, x, one to four channels).
+        White is the maximum of the truth, or of the result if the truth is unknown. All images have the finest
+        resolution of these volumes. Empty unless the parameter is a volume (z, y, x, one to four channels).
         """
         if self.result.ndim != 4 or self.result.shape[3] > 4:
             return {}
@@ -129,24 +138,30 @@ class Recovered:
         return {kind: slices(matched(volume, finest)) / white for kind, volume in given.items()}
 
     def numbers(self) -> dict[str, list[float]]:
-        """Initial value, result and truth as numbers; empty for more than 16 numbers or more than one dimension."""
+        """Return initial value, result and truth as numbers.
+
+        Empty if the parameter has more than 16 numbers or more than one dimension.
+        """
         if self.result.ndim > 1 or self.result.size > 16:
             return {}
         return {kind: value.tolist() for kind, value in self.known("start", "result", "truth").items()}
 
     def error(self, kind: str = "result") -> float | None:
-        """Root mean square error of 'start', 'result' or 'baseline'; None if it or the truth does not exist."""
+        """Return the root mean square error of a kind: 'start', 'result' or 'baseline'.
+
+        None if there is no value of this kind, or if the truth is unknown.
+        """
         value = getattr(self, kind)
         return None if self.truth is None or value is None else rmse(value, self.truth)
 
     def relative_error(self) -> float | None:
-        """|result - truth| / |truth| (L2 norms); None if the truth is unknown or zero."""
+        """Return |result - truth| / |truth| in L2 norms; None if the truth is unknown or zero."""
         if self.truth is None or not self.truth.any():
             return None
         return float(np.linalg.norm(matched(self.result, self.truth) - self.truth) / np.linalg.norm(self.truth))
 
     def as_dict(self) -> Json:
-        """Entry of parameters.json: small values in full, large ones by shape, mean and range."""
+        """Return the entry in parameters.json: values of up to 16 numbers in full, others as shape, mean and range."""
         value = self.result
         table: Json = {"shape": list(value.shape)}
         if value.size <= 16:
@@ -160,28 +175,28 @@ class Recovered:
 
 
 def number_of(items: Iterable[Recovered]) -> int:
-    """Number of recovered parameters, without derived ones."""
+    """Return the number of parameters that are not derived from others."""
     return sum(not item.derived for item in items)
 
 
 @dataclass(frozen=True)
 class RecoveredPose:
-    """One pose: initial and resulting translation and rotation vector (degrees) by part, and their errors."""
+    """A pose of a run: initial and resulting parts, which are a translation and a rotation vector (degrees)."""
 
     pose: Pose
     start: dict[str, Array]
     result: dict[str, Array]
     value: Array
-    """Resulting transform (4 x 4) or vertices."""
+    """Resulting transform (4 x 4), or resulting vertices."""
     value_at_start: Array
 
     def errors(self) -> dict[str, PoseError]:
-        """Errors of the result and of the initial value; empty if the truth is unknown."""
+        """Return the errors of result and initial value ('error', 'error_at_start'); empty if the truth is unknown."""
         values = {"error": self.value, "error_at_start": self.value_at_start}
         return {kind: error for kind, value in values.items() if (error := self.pose.error(value)) is not None}
 
     def rows(self) -> dict[str, str]:
-        """Table rows: the parts of the pose, and its errors."""
+        """Return table rows by name: the parts of the pose, and its errors."""
         table: dict[str, str] = {}
         for kind, parts in (("start", self.start), ("recovered", self.result)):
             for part, array in parts.items():
@@ -190,7 +205,7 @@ class RecoveredPose:
         return table | {kind.replace("_at_", " at the "): str(e) for kind, e in reversed(self.errors().items())}
 
     def as_dict(self) -> Json:
-        """Entry of parameters.json."""
+        """Return the entry of this pose in parameters.json."""
         table: Json = {"pose": self.pose.kind, "pivot": list(self.pose.pivot)}
         for kind, parts in (("start", self.start), ("result", self.result)):
             table[kind] = {part: array.tolist() for part, array in parts.items()}
@@ -206,7 +221,7 @@ class RecoveredPose:
 
 @dataclass(frozen=True)
 class Contestant:
-    """One of two integrators that ran for equal time, and the final errors of its parameters and poses."""
+    """A run or its baseline, compared at equal time, with the final errors of its parameters and poses by name."""
 
     name: str
     run: Run
@@ -215,7 +230,7 @@ class Contestant:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All content of the report."""
+    """All data of the report."""
 
     config: Config
     source: Path | None
@@ -230,23 +245,23 @@ class Outcome:
     notes: tuple[str, ...]
     verdict: Verdict
     in_python: bool = False
-    """See `Job`."""
+    """Whether the job has Python objects; see `Job`."""
 
     @property
     def complete(self) -> bool:
-        """Whether all iterations are done, or the optimizer has terminated."""
+        """Return whether all iterations are done, or the optimizer has terminated."""
         return len(self.run.history) >= self.config.iterations or bool(self.run.optimiser.finished)
 
     def test_views(self) -> list[ViewPictures]:
-        """The views that were excluded from the optimization."""
+        """Return the views that were excluded from the optimization."""
         return [view for view in self.views if view.is_test]
 
     def has_flip(self) -> bool:
-        """Whether FLIP was computed for any view."""
+        """Return whether the image metric FLIP was computed for any view."""
         return any(view.likenesses["result"].flip is not None for view in self.views)
 
     def command(self) -> str:
-        """Return the command line, or the call in Python, that repeats this run, or resumes it if it was stopped."""
+        """Return the command line or Python call that repeats this run, or resumes this run if it is incomplete."""
         if not self.complete:
             return resume_command(self.folder, self.in_python)
         if self.in_python:
@@ -256,13 +271,16 @@ class Outcome:
         return f"pathreplay optimize {shlex.quote(str(job))}{changes if self.source else ''}"
 
     def names(self) -> tuple[str, str]:
-        """Names of the job and its baseline: their integrators, with a suffix if both are the same."""
+        """Return the names of the job and of its baseline, which are their integrators.
+
+        If both integrators are the same, the second name has a suffix.
+        """
         job = self.config.integrator.type
         baseline = job if self.config.baseline is None else self.config.baseline.type
         return job, baseline if baseline != job else f"{baseline} (baseline)"
 
     def caption(self, kind: str) -> str:
-        """Caption of an image, texture or volume of that kind."""
+        """Return the caption of an image, texture or volume of a kind."""
         job, baseline = self.names()
         captions = {
             "result": "recovered" if self.run.baseline is None else f"recovered by {job}",
@@ -273,7 +291,7 @@ class Outcome:
         return captions.get(kind, kind)
 
     def comparison(self) -> list[Contestant]:
-        """The job and its baseline in numbers; empty without a baseline."""
+        """Return the job and its baseline for a comparison; empty without a baseline."""
         if self.run.baseline is None:
             return []
         runs = zip(self.names(), (self.run, self.run.baseline), ("result", "baseline"), strict=True)

@@ -13,7 +13,7 @@ from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.report.outcome import Recovered, RecoveredPose
 from pathreplay.report.pages.page import Plot, Row, Series, thinned
 
-# Maximum number of pixels from which the common exposure is computed: more do not change it.
+# Maximum number of pixels from which the common exposure is computed. More pixels do not change the exposure.
 MOST_LEVELS = 1_000_000
 
 THINNED = "Of {} iterations, every {}th is drawn."
@@ -25,27 +25,27 @@ def uri(kind: str, data: bytes) -> str:
 
 
 def common_exposure(targets: Sequence[Image]) -> float:
-    """Display exposure of all views: 98 % of the (subsampled) target pixels stay below white."""
+    """Return the display exposure for all views, with which 98 % of the (subsampled) target pixels are below white."""
     step = max(1, sum(target.shape[0] * target.shape[1] for target in targets) // MOST_LEVELS)
     levels = [target[..., :3].max(axis=2).reshape(1, -1, 1)[:, ::step] for target in targets]
     return exposure_for(np.concatenate(levels, axis=1)) if levels else 1.0
 
 
 def lead(config: Config, parameters: int, learned: int, test_views: int) -> tuple[str, str, str]:
-    """The sentence at the top: parameters, name of the scene, and number of images."""
+    """Return the sentence at the top of a page in three parts: parameters, name of the scene, and number of images."""
     test = f", {test_views} test view{'s' if test_views != 1 else ''}" if test_views else ""
     images = f" recovered from {learned} image{'s' if learned != 1 else ''}{test}"
     return f"{parameters} parameter{'s' if parameters != 1 else ''} of ", config.scene, images
 
 
 def dropped_notice(history: Sequence[Entry]) -> tuple[str, ...]:
-    """A notice of gradient entries that were not finite, if any."""
+    """Return a notice that gradient entries were not finite, or nothing if all were finite."""
     dropped = sum(entry.dropped for entry in history)
     return (f"{dropped} gradient entries were NaN or infinite and were set to zero.",) if dropped else ()
 
 
 def facts(config: Config, history: Sequence[Entry]) -> tuple[tuple[str, str], ...]:
-    """Key figures at the top of the page: value and label."""
+    """Return the key figures at the top of a page, each as value and label."""
     figures = [(f"{len(history)}", "iterations")]
     if history:
         seconds = sum(entry.seconds for entry in history)
@@ -57,12 +57,16 @@ def facts(config: Config, history: Sequence[Entry]) -> tuple[tuple[str, str], ..
 
 
 def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
-    """Plots of the loss, and per parameter of its error (if the truth is known) and of its gradient and noise norms."""
+    """Return plots over the iterations.
+
+    One plot shows the loss. For each parameter, plots show its error (if the truth is known), and the norms of its
+    gradient and gradient noise. Regularizers are plotted if present, and samples per pixel if they vary.
+    """
     entries = [history[i] for i in thinned(len(history))]
     x = tuple(float(entry.iteration) for entry in entries)
 
     def plot(title: str, code: str, **lines: Iterable[float | None]) -> Plot:
-        """Make a plot of ``lines`` over the iterations; a legend names them if there are several."""
+        """Make a plot of ``lines`` over the iterations; a legend names the lines if there are several."""
         series = (Series(name * (len(lines) > 1), x, tuple(_rounded(v) for v in y)) for name, y in lines.items())
         return Plot(title, tuple(series), code=code)
 
@@ -74,7 +78,7 @@ def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
     if not history:
         return tuple(drawn)
     errors, norms = history[-1].errors, history[-1].gradient_norms
-    for key in dict.fromkeys([*norms, *errors]):  # errors of poses have other keys than their gradients
+    for key in dict.fromkeys([*norms, *errors]):  # the errors and the gradients of a pose have different keys
         if key in errors:
             drawn.append(plot("error of", key, error=(entry.errors.get(key) for entry in entries)))
         if key in norms:
@@ -86,18 +90,18 @@ def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
 
 
 def plots_note(history: Sequence[Entry]) -> str:
-    """A note if the curves omit iterations, else an empty text."""
+    """Return a note if the curves omit iterations, otherwise ""."""
     taken = thinned(len(history))
     return THINNED.format(len(history), taken[1] - taken[0]) if len(taken) < len(history) else ""
 
 
 def _rounded(value: float | None) -> float | None:
-    """Round to six digits, more than a curve shows; None for values that are not finite, which are not drawn."""
+    """Round to six digits, which suffice for a curve. Values that are not finite become None, and are not drawn."""
     return None if value is None or not np.isfinite(value) else float(f"{value:.6g}")
 
 
 def numbers(item: Recovered) -> tuple[Row, ...]:
-    """Table rows of a small parameter: initial value, result, truth and relative error."""
+    """Return the table rows of a small parameter: initial value, result, truth and relative error."""
     rows = []
     for kind, values in item.numbers().items():
         text = ", ".join(f"{value:.4g}" for value in values)
@@ -109,7 +113,7 @@ def numbers(item: Recovered) -> tuple[Row, ...]:
 
 
 def about(item: Recovered, baseline: str = "") -> str:
-    """A sentence on the size and the error of a large parameter."""
+    """Return a sentence about the size and the error of a large parameter. ``baseline`` is the baseline's name."""
     shape, result = item.result.shape, item.result
     words = {3: " x ".join(map(str, shape[1::-1])) + " texels", 4: " x ".join(map(str, shape[2::-1])) + " voxels"}
     if item.textures():
@@ -129,12 +133,12 @@ def about(item: Recovered, baseline: str = "") -> str:
 
 
 def pose_rows(item: RecoveredPose) -> tuple[Row, ...]:
-    """Table rows of a pose."""
+    """Return the table rows of a pose: its parts and errors."""
     return tuple(Row(name, (text,)) for name, text in item.rows().items())
 
 
 def pose_note(item: RecoveredPose) -> str:
-    """A note on the reference frame and the units of a pose."""
+    """Return a note about the reference frame and the units of a pose."""
     pose = item.pose
     compared = "" if pose.distance is None else f"; distances are compared with {pose.distance:.4g}"
     pivot = ", ".join(f"{x:.4g}" for x in pose.pivot)
@@ -143,18 +147,18 @@ def pose_note(item: RecoveredPose) -> str:
 
 
 def swatch(values: list[float]) -> str:
-    """CSS colour of linear RGB values; colours brighter than white are scaled down with their hue preserved."""
+    """Return the CSS colour of linear RGB values. Colours brighter than white are scaled down, with the same hue."""
     colour = np.array(values, dtype=np.float32).clip(min=0)
     return "#" + "".join(f"{round(float(c) * 255):02x}" for c in encoded(colour / max(1.0, float(colour.max()))))
 
 
 def integrator_row(config: Config) -> Row:
-    """Table row of the integrator and its properties."""
+    """Return the table row of the integrator and its properties."""
     return Row("integrator", (", ".join(f"{k} = {v}" for k, v in config.integrator.model_dump().items()),))
 
 
 def target_row(config: Config) -> Row:
-    """Table row of the source of the targets."""
+    """Return the table row about the source of the target images."""
     target = config.target
     if config.capture is not None:
         return Row("targets", (config.capture.source,))

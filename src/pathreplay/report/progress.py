@@ -13,15 +13,15 @@ from rich.console import Console
 from pathreplay.errors import plain_line
 from pathreplay.inverse.loop.events import Event, Notes, Started, Stepped
 
-# Minimum time between two lines without a bar, so that the log of a long run stays readable.
+# Without a bar: minimum seconds between two lines, so that the log of a long run stays readable.
 _SECONDS = 10.0
 
 
 class _Forgiving:
-    """Stderr that ignores write errors: a closed terminal must not prevent the results from being written.
+    """Stream that writes to stderr and ignores errors: a closed terminal must not keep a run from writing its results.
 
-    It also ignores a missing stderr (None in a program without a console), and the RuntimeError that Python raises if
-    a signal handler prints while the interrupted code is printing.
+    It ignores write errors, a missing stderr (None in a program without a console), and the RuntimeError that Python
+    raises if a signal handler prints while the interrupted code is printing.
     """
 
     def __init__(self) -> None:
@@ -42,9 +42,9 @@ class _Forgiving:
 
 
 class Progress:
-    """Shows the progress of a job, or nothing if not ``shown``; a context manager.
+    """Context manager that shows the progress of a job, or nothing unless ``shown``.
 
-    It never uses rich's notebook bar, which needs ipywidgets and shows nothing without them; see `NotebookPanel`.
+    The notebook bar of rich is not used, because it shows nothing without ipywidgets. `NotebookPanel` replaces it.
     """
 
     def __init__(self, shown: bool) -> None:

@@ -21,7 +21,7 @@ VERTICES = ".vertex_positions"
 
 
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
-    """The parameters that are not poses; derived parameters come last."""
+    """Return the parameters that are not poses. Derived parameters come last."""
     parts = {name for pose in problem.poses for name in pose.of}
     truths = [(v.key, v.truth) for v in problem.variables if v.key not in parts and v.key != EXPOSURE]
     derived = {parameter.key: parameter.truth for parameter in problem.derived}
@@ -37,7 +37,7 @@ def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
 
 
 def with_faces(problem: Problem, items: tuple[Recovered, ...]) -> tuple[Recovered, ...]:
-    """Add the faces of the mesh to parameters that are mesh vertices."""
+    """Add the faces of the mesh to parameters that consist of mesh vertices."""
     params: Mapping[str, object] = (
         mi.traverse(problem.scene) if any(item.key.endswith(VERTICES) for item in items) else {}
     )
@@ -47,7 +47,7 @@ def with_faces(problem: Problem, items: tuple[Recovered, ...]) -> tuple[Recovere
 
 
 def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
-    """The parameters that are poses."""
+    """Return the parameters that are poses."""
     if not problem.poses:
         return ()
     starts = with_scene(problem, {v.key: v.start for v in problem.variables})
@@ -59,7 +59,7 @@ def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
 
 
 def with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
-    """Decoded values of the variables, and of the poses and derived parameters that are computed from them."""
+    """Return decoded values of variables, and of the poses and derived parameters that are computed from variables."""
     inputs = {name for computed in problem.made() for name in computed.of}
     if not inputs:
         return dict(values)
@@ -69,6 +69,6 @@ def with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
 
 
 def _parts(pose: Pose, values: Arrays) -> dict[str, Array]:
-    """Translation and rotation vector (degrees) of a pose."""
+    """Return the translation and the rotation vector (degrees) of a pose, by part."""
     parts = {part: values[name] for part, name in pose.parts().items()}
     return {part: np.degrees(value) if part == "rotation" else value for part, value in parts.items()}

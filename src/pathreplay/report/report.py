@@ -1,4 +1,4 @@
-"""The report: the job, its results and their errors, as one self-contained HTML file."""
+"""The report about a job, its results and their errors, as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ from pathreplay.report.pages.page import Comparison, Head, Mesh, Page, Parameter
 # Colours that are readable on light and dark backgrounds.
 JOB, BASELINE, GREY = "#3b82f6", "#e07b39", "#808080"
 
-# Limits of views and of pixels in all images: a report may be sent by mail, and a noisy pixel takes about four bytes of
-# the page. All views at full resolution are files in the run folder.
+# Largest number of views, and of pixels in all images, because a report may be sent by mail. A noisy pixel takes about
+# four bytes of the page. The run folder contains all views at full resolution.
 MOST_VIEWS, MOST_PIXELS = 24, 6_000_000
-# Limit of faces of an interactive mesh: about 3 MB of the page.
+# Largest number of faces of an interactive mesh, which then takes about 3 MB of the page.
 MOST_FACES = 50_000
 
 Film = tuple[Still, ...]
 
-# Number of parameters with a panel of their own in the comparison, beside the panel of the images.
+# Largest number of parameters whose errors are plotted in the comparison, next to the image error.
 PANELS = 2
 
 
 def report_files(outcome: Outcome, films: Mapping[str, Film] | None = None) -> dict[str, bytes]:
-    """Content of report.html, of the curves (SVG, PNG) and of summary.png, by file name.
+    """Return the content of report.html, of the curves (SVG, PNG) and of summary.png, by file name.
 
-    ``films`` are by view and parameter; see `films` in `live_page`.
+    ``films`` are film frames by subject; see `live_page.films`.
     """
     contestants = outcome.comparison()
     with own_settings():
@@ -72,7 +72,7 @@ def report_files(outcome: Outcome, films: Mapping[str, Film] | None = None) -> d
 def report_page(
     outcome: Outcome, contestants: Sequence[Contestant], drawings: Mapping[str, str], films: Mapping[str, Film]
 ) -> Page:
-    """The report as a page; ``drawings`` are the data URIs of the curves by name."""
+    """Return the content of the report. ``drawings`` are the data URIs of the curves by name."""
     config, history = outcome.config, outcome.run.history
     ended = f"Stopped after {len(history)} of {config.iterations} iterations."
     if why := outcome.run.optimiser.finished:
@@ -156,7 +156,7 @@ def _likeness_note(outcome: Outcome) -> str:
 
 
 def _shown(outcome: Outcome) -> tuple[list[ViewPictures], float]:
-    """The views whose images are in the report, and the factor by which these are scaled to limit its size."""
+    """Return the views whose images are in the report, and the factor by which the images are scaled."""
     views = list(outcome.views)
     if len(views) > MOST_VIEWS:
         views = [views[i * len(views) // MOST_VIEWS] for i in range(MOST_VIEWS)]
@@ -195,7 +195,7 @@ def _views(outcome: Outcome, exposure: float, films: Mapping[str, Film]) -> tupl
 
 
 def _mesh(item: Recovered) -> Mesh | None:
-    """Interactive mesh of initial value, result and truth; None without faces or with too many for a page."""
+    """Return an interactive mesh of initial value, result and truth; None if there are no faces, or too many."""
     if item.faces is None or item.faces.size > 3 * MOST_FACES:
         return None
     known = {
@@ -212,7 +212,7 @@ def _smaller(image: Image, scale: float) -> Image:
 
 
 def _parameters(outcome: Outcome, films: Mapping[str, Film]) -> tuple[Parameter, ...]:
-    """Sections of textures, volumes, numbers, poses and other parameters, in this order."""
+    """Return the sections about textures, volumes, numbers, poses and other parameters, in this order."""
 
     def pictures(images: Mapping[str, Image]) -> tuple[Picture, ...]:
         return tuple(
@@ -249,7 +249,10 @@ def loss_figure(history: Sequence[Entry]) -> Figure:
 
 
 def comparison_figure(contestants: Sequence[Contestant]) -> Figure:
-    """Plot errors of two runs against seconds: of images and of the first keys; errors of poses are logarithmic."""
+    """Plot the errors of two runs against time: of the images, and of the first `PANELS` parameters and poses.
+
+    Errors of poses have a logarithmic scale.
+    """
     panels = [None, *list(contestants[0].errors)[:PANELS]]
     figure = Figure(figsize=(4.4 * len(panels), 3.0), layout="constrained")
     for axes, key in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
@@ -292,19 +295,22 @@ def _plain(axes: Axes, along: str) -> None:
         axes.spines[side].set_visible(False)
 
 
-# Maximum number of views, and of grids, in summary.png; the report has all of them.
+# Largest number of views, and of textures and volumes, in summary.png.
 SUMMARY_ROWS = 3
 SUMMARY_SIDE = 512
-"""Maximum pixels along a side before an image is drawn 210 pixels wide; more would only take memory."""
+"""Pixels. Larger images are reduced to this side to save memory, before they are drawn with a width of 210 pixels."""
 
 
 def summary(outcome: Outcome) -> bytes:
-    """Draw the overview PNG: a row of images per view (target, initial, result, difference), texture and volume."""
+    """Draw summary.png, with a row of images for each view, texture and volume.
+
+    The row of a view shows target, initial image, result and difference.
+    """
     rows = [(v.name, v.pictures(), v.exposure) for v in outcome.views[:SUMMARY_ROWS]]
     grids = [(r.key, r.textures() or r.volumes()) for r in outcome.recovered]
     rows += [(key, images, 1.0) for key, images in [row for row in grids if row[1]][:SUMMARY_ROWS]]
     columns = max(len(images) for _, images, _ in rows)
-    # Row heights in inches: images are 2.1 wide, and titles take 0.2.
+    # Row heights in inches: images are 2.1 inches wide, and titles are 0.2 inches high.
     heights = [0.2 + 2.1 * image.shape[0] / image.shape[1] for _, images, _ in rows for image in [images["start"]]]
     figure = Figure(figsize=(2.1 * columns, sum(heights)), layout="constrained", dpi=100)
     grid = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
@@ -317,8 +323,8 @@ def summary(outcome: Outcome) -> bytes:
             label = outcome.caption(kind)
             short = name if len(name) <= 24 else f"…{name[-23:]}"  # must fit above an image
             line[column].set_title(label if column else f"{short}: {label}", fontsize=8)
-    # Reduce to 256 colours, which keeps noisy images small enough for a README or a mail. Pillow dithers if it is given
-    # a palette.
+    # Reduce the image to 256 colours, so that noisy images are small enough for a README or a mail. Pillow dithers if a
+    # palette is given.
     picture = PIL.Image.open(io.BytesIO(drawn(figure, "png"))).convert("RGB")
     buffer = io.BytesIO()
     picture.quantize(palette=picture.quantize(256)).save(buffer, "png", optimize=True)
@@ -326,7 +332,7 @@ def summary(outcome: Outcome) -> bytes:
 
 
 def versions() -> dict[str, str]:
-    """Versions and system properties that a run depends on besides its config."""
+    """Return versions and system properties on which a run depends besides its config, by name."""
     return {
         "pathreplay": version("pathreplay"),
         "Mitsuba": version("mitsuba"),

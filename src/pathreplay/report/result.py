@@ -1,4 +1,4 @@
-"""The result of a run: its outcome, its files, and the `RunResult` of the Python API."""
+"""Collects the outcome of a run, and makes the result files and the `RunResult` of the Python API from it."""
 
 from __future__ import annotations
 
@@ -29,38 +29,38 @@ from pathreplay.scenes.volume_files import vol_bytes
 
 @dataclass(frozen=True, repr=False)
 class RunResult:
-    """Result of a run; everything in it is also in ``folder``."""
+    """Result of a run. The files in ``folder`` contain the same data."""
 
     folder: Path
     report: Path
     iterations: int
-    """Completed iterations; fewer than the job's when it was stopped."""
+    """Number of completed iterations, which is smaller than in the job if the run was stopped."""
     stopped: bool
-    """True when a signal ended the run early; it can be resumed."""
+    """Whether the run was stopped early. A stopped run can be resumed."""
     stopped_by: str | None
-    """'Ctrl-C', 'SIGTERM', 'SIGHUP', 'the stop button' or 'stop()'."""
+    """What stopped the run: 'Ctrl-C', 'SIGTERM', 'SIGHUP', 'the stop button' or 'stop()'; None if not stopped."""
     history: tuple[Entry, ...]
     parameters: dict[str, Array]
     errors: dict[str, float]
-    """Root mean square error of each parameter whose truth is known; poses are in ``poses``."""
+    """Root mean square error of each parameter whose true value is known, except poses."""
     poses: dict[str, PoseError]
-    """Error of each pose whose truth is known."""
+    """Error of each pose whose true value is known."""
     views: dict[str, Likeness]
-    """Image metrics of each view against its target."""
+    """Image metrics of the result of each view, compared with its target."""
     test_views: tuple[str, ...]
-    """The views that were excluded from the optimization."""
+    """Names of the views that were excluded from the optimization."""
     verdict: Verdict
-    """Which values are still moving, have converged, or are not determined by the images."""
+    """Which values still move, have converged, or are not determined by the images."""
 
     def __repr__(self) -> str:
-        """A short form, since a notebook prints it and the history may have thousands of entries."""
+        """Return a short description for notebooks, because the history may have thousands of entries."""
         loss = f", loss {self.history[-1].loss:.4g}" if self.history else ""
         stopped = ", stopped early" if self.stopped else ""
         count = f"{len(self.parameters)} parameters"
         return f"<RunResult: {self.iterations} iterations{loss}{stopped}, {count}, {self.report}>"
 
     def describe(self) -> str:
-        """Lines for the terminal: loss, errors, path of the report, command to resume, and the verdict."""
+        """Return lines for the terminal: loss, errors, path of the report, command to resume, and verdict."""
         lines = []
         if self.history:
             first, last = self.history[0].loss, self.history[-1].loss
@@ -94,8 +94,8 @@ def outcome_of(
 ) -> Outcome:
     """Collect the outcome of a run.
 
-    ``before``, ``after`` and ``baselines`` are the images of the initial values, the result and the baseline's result
-    by view name.
+    ``before``, ``after`` and ``baselines`` are images by view name: at the initial values, of the result, and of the
+    baseline's result.
     """
     views = tuple(
         ViewPictures(
@@ -120,7 +120,7 @@ def outcome_of(
 
 
 def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Content]:
-    """All files of a finished run, including the report with its ``films``, by name in the run folder."""
+    """Return the content of all result files, including the report with its ``films``, by name in the run folder."""
     table = {item.key: item.as_dict() for item in outcome.recovered}
     table |= {item.pose.key: item.as_dict() for item in outcome.poses}
     files: dict[str, Content] = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
@@ -144,7 +144,7 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Conte
 
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
-    """The `RunResult`; ``stopped_by`` names what asked to stop, and is ignored if the run was already complete."""
+    """Return the `RunResult`. ``stopped_by`` is the source of a stop request, which a complete run ignores."""
     stopped = not outcome.complete
     return RunResult(
         folder=outcome.folder,

@@ -1,1 +1,1 @@
-"""Run folders: the files of a job, and the lock that gives one process write access."""
+"""Run folders: the files of a run, and the lock that gives write access to one process."""

@@ -1,4 +1,4 @@
-"""The lock of a run folder: one process writes at a time, and the system releases the lock when that process ends."""
+"""The lock of a run folder: one process writes at a time, and the system releases the lock when this process ends."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ LOCK = "lock"
 
 
 class FolderLock:
-    """Holds the lock file of ``folder`` from construction to `close`.
+    """Locks a file in ``folder`` from construction to `close`.
 
-    The file remains when the lock is released. Only the lock on it (flock) counts, which the system releases when the
-    process ends for any reason. Nothing is locked if the file system or the operating system does not support flock.
+    The file remains when the lock is released, and does not by itself lock the folder. The system releases the lock
+    (flock) when the process ends for any reason. If the file system or the operating system does not support flock,
+    nothing is locked.
 
     Raises PathreplayError if another process or thread holds the lock, or if the folder cannot be written.
     """
@@ -60,7 +61,7 @@ class FolderLock:
             ) from None
         except OSError:
             return  # the file system does not support locks
-        with contextlib.suppress(OSError):  # the lock holds even if the disk is full
+        with contextlib.suppress(OSError):  # the lock is valid even if the disk is full
             os.ftruncate(self.file, 0)
             os.pwrite(self.file, f"{os.getpid()} {socket.gethostname()}\n".encode(), 0)
 

@@ -31,14 +31,15 @@ _FOLDERS = "images", "volumes", "baseline", "previews"
 CHECKPOINT = "checkpoint.safetensors"
 BASELINE_CHECKPOINT = "baseline/checkpoint.safetensors"
 IN_MEMORY = "memory"
-"""Name of a scene object in the config."""
+"""Value of ``scene`` in the config of a run whose scene is an object in memory."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """The config of a run, the file that it was read from (None if from Python), and the base of its relative paths.
+    """The config of a run, and its origin.
 
-    ``changes`` are the ``--set`` options of the command line.
+    ``source`` is the file of the config (None: the config comes from Python), ``base`` the folder to which relative
+    paths in the config refer, and ``changes`` are the ``--set`` options of the command line.
     """
 
     config: Config
@@ -46,11 +47,11 @@ class Job:
     base: Path
     changes: tuple[str, ...] = ()
     in_python: bool = False
-    """Parts of it are Python objects, which the config cannot describe."""
+    """Whether parts of the job are Python objects, which the config cannot describe."""
 
 
 def resume_command(folder: Path, in_python: bool = False) -> str:
-    """Return the command that resumes a run, or the call in Python if its job has objects."""
+    """Return the command that resumes a run, or the Python call if the job has Python objects (``in_python``)."""
     if in_python:
         return f"pathreplay.minimize(problem, output={str(folder)!r}, resume=True)"
     return f"pathreplay optimize --resume {shlex.quote(str(folder))}"
@@ -60,9 +61,9 @@ class RunFolder:
     """A folder that belongs to one run until its ``lock`` is closed.
 
     Args:
-        given: its path relative to ``home``.
-        home: folder that ``given`` is relative to (default: the current folder). A later change of the current folder
-            has no effect.
+        given: path of the folder, absolute or relative to ``home``.
+        home: folder to which ``given`` refers; default: the folder that is current at construction.
+        in_python: whether the job has Python objects; see `Job`.
     """
 
     def __init__(self, given: Path, home: Path | None = None, in_python: bool = False) -> None:
@@ -72,25 +73,25 @@ class RunFolder:
         self.lock = FolderLock(self.path)
         self.identity = _identity(self.path)
         self.created_parents: list[Path] = []
-        """Parent folders that were created for it, innermost first."""
+        """Parent folders that were created for this folder, innermost first."""
 
     @property
     def name(self) -> Path:
-        """The path to show to the user, as seen from the current folder."""
+        """Return the path to show to the user, which is valid from the current folder."""
         with contextlib.suppress(OSError):  # the current folder may be gone
             if Path.cwd() == self.home:
                 return self.given
         return self.path
 
     def resume_command(self, name: Path | None = None) -> str:
-        """Return the command or call that resumes its run, for a folder ``name`` (default: its own)."""
+        """Return the command or Python call that resumes this run from a folder ``name`` (default: this folder)."""
         return resume_command(self.name if name is None else name, self.in_python)
 
     def remove(self) -> None:
-        """Remove the folder with its contents and created parents, unless another folder has taken its path."""
+        """Remove the folder and the parents that were created for it, unless another folder now has its path."""
         if _identity(self.path) != self.identity:
             return
-        # Rename first: the process may end during the removal, and a partial folder would look like a run.
+        # Rename first: if the process ends during the removal, a partial folder must not look like a run.
         hidden = self.path.with_name(f".{self.path.name[:100]}.{secrets.token_hex(4)}{PART}")
         with contextlib.suppress(OSError):
             os.rename(self.path, hidden)
@@ -100,9 +101,9 @@ class RunFolder:
         _remove_empty(self.created_parents)
 
     def require_in_place(self, lost: str, descriptor: int | None = None) -> None:
-        """Raise PathreplayError if the path (or the open ``descriptor``) is no longer this folder.
+        """Raise PathreplayError if the path (or the open ``descriptor``) no longer refers to this folder.
 
-        ``lost`` names what was not saved, with its verb: "iterations 3 to 5 are".
+        ``lost`` names the unsaved data with a verb, such as "iterations 3 to 5 are".
         """
         if _identity(self.path if descriptor is None else descriptor) != self.identity:
             raise PathreplayError(
@@ -111,24 +112,24 @@ class RunFolder:
             )
 
     def write(self, files: Mapping[str, Content]) -> None:
-        """Write all files or none: each is written under a temporary name, then all are renamed.
+        """Write all files or none: each file is written under a temporary name, and then all files are renamed.
 
-        Links are not followed: a link in the place of a file is replaced. Contents that are generated while they are
-        written (see `Content`) are in memory only during that time.
+        A symbolic link in the place of a file is replaced instead of followed. Content given as a function (see
+        `Content`) is in memory only while it is written.
 
         Args:
-            files: content by file name relative to the folder; folders in the name are created.
+            files: content by file name relative to the folder; missing subfolders are created.
 
         Raises:
-            PathreplayError: the disk is full, the folder is gone or cannot be written, or a folder in it is a link to
-                somewhere else. Temporary files are removed, and so are folders that were created for them.
+            PathreplayError: the disk is full, the folder is gone or cannot be written, or a subfolder is a symbolic
+                link. Temporary files and the subfolders that were created for them are removed.
         """
         parts: list[str] = []
         created: list[str] = []
         lost = "unwritten data is"
         with _opened(self.path) as descriptor:
             self.require_in_place(lost, descriptor)
-            # Paths are relative to the open folder: another folder, or a link, may take its name meanwhile.
+            # Paths are relative to the open folder, because another folder or a link may get its name meanwhile.
             base = self.path if descriptor is None else Path()
             try:
                 for name, content in files.items():
@@ -149,9 +150,9 @@ class RunFolder:
                 raise
 
     def discard(self, names: Iterable[str]) -> None:
-        """Remove files of the folder, unless another folder has taken its path. Links to folders are not followed.
+        """Remove files of the folder, unless another folder now has its path.
 
-        Raises nothing.
+        Files in subfolders that are symbolic links are not removed. Raises nothing.
         """
         with _opened(self.path) as descriptor:
             if _identity(self.path if descriptor is None else descriptor) != self.identity:
@@ -187,14 +188,14 @@ class RunFolder:
 
 
 def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home: Path | None = None) -> RunFolder:
-    """Create a run folder with the job and its first files; a failure leaves no folder behind.
+    """Create a run folder with the job and its first files. A failure leaves no folder behind.
 
     Args:
-        output: path of the folder. If it exists, the first free one of ``output-2``, ``output-3``, … is created.
-        job: its config is copied as written (``config.toml`` or ``.yaml``), or as JSON if it came from Python or was
-            changed.
+        output: path of the folder. If the path exists, the first free path of ``output-2``, ``output-3``, … is used.
+        job: the job. Its config file is copied unchanged as ``config.toml`` or ``config.yaml``. A config that comes
+            from Python or JSON, or was changed on the command line, is written as ``config.json``.
         files: content of further files by name.
-        home: folder that a relative ``output`` starts at (default: the current folder).
+        home: folder to which a relative ``output`` refers; default: the current folder.
 
     Raises:
         PathreplayError: the folder cannot be created or written.
@@ -229,7 +230,7 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
 
 
 class _Origin(BaseModel):
-    """Content of run.json: base of the config's relative paths, path of the config file, and fields of `Job`."""
+    """Content of run.json; ``config`` is the path of the config file, and the other fields are those of `Job`."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
@@ -240,11 +241,18 @@ class _Origin(BaseModel):
 
 
 def open_run_folder(path: Path, in_python: bool = False) -> tuple[Job, RunFolder]:
-    """Open and lock an existing run folder; returns its job and the folder.
+    """Open and lock an existing run folder, and remove temporary files of a killed run.
 
-    Temporary files of a killed run are removed. Raises PathreplayError if ``path`` is not a run folder, has no
-    checkpoint, is damaged, or is in use; or if it was started from objects in Python and is not resumed there
-    (``in_python``), or the other way round.
+    Args:
+        path: path of the folder.
+        in_python: whether the caller can supply the Python objects of a job; see `Job`.
+
+    Returns:
+        The job and the folder.
+
+    Raises:
+        PathreplayError: ``path`` is not a run folder, has no checkpoint, is damaged or in use, or the job has Python
+            objects and ``in_python`` is False, or vice versa.
     """
     require_writable_name(path, "--resume")
     copy = _config_in(path)
@@ -270,7 +278,10 @@ def _remove_parts(path: Path) -> None:
 
 
 def read_job(path: Path) -> Job:
-    """Read the job of a run folder, even if in use. Raises PathreplayError if it is not a run folder or damaged."""
+    """Read the job of a run folder, which may be in use.
+
+    Raises PathreplayError if ``path`` is not a run folder, or is damaged.
+    """
     return _job(path, _config_in(path))
 
 
@@ -298,9 +309,10 @@ def _job(path: Path, copy: Path) -> Job:
 
 
 def new_output(output: str | Path | None, source: Path | None) -> Path:
-    """Path of a new run folder: ``output``, or ``runs/NAME`` with the name of the config file ``source``.
+    """Return the path of a new run folder: ``output``, or ``runs/NAME`` if ``output`` is None.
 
-    A file named ``config`` stands for its folder's name. Raises PathreplayError if ``output`` cannot be a folder.
+    NAME is the name of the config file ``source``. For a file that is called ``config``, NAME is the name of its
+    folder; without ``source``, NAME is ``optimize``. Raises PathreplayError if ``output`` cannot be a folder.
     """
     if output is None:
         named = "optimize" if source is None else source.stem
@@ -315,7 +327,7 @@ def new_output(output: str | Path | None, source: Path | None) -> Path:
 
 
 def require_writable_name(path: Path, option: str) -> None:
-    """Raise PathreplayError if the path is not UTF-8, as reports need it, or is not a valid path."""
+    """Raise PathreplayError if the path is invalid, or is not UTF-8, which reports require."""
     try:
         str(path).encode()
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -328,14 +340,14 @@ def require_writable_name(path: Path, option: str) -> None:
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Remove those folders that are empty; another process may have put files into one."""
+    """Remove the folders that are empty. Another process may have put files into the others."""
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()
 
 
 def _make_part(output: Path, home: Path) -> Path:
-    """Create a hidden folder beside ``output``; it is renamed when complete, since a process may end at any time."""
+    """Create a hidden folder beside ``output``, which is renamed to ``output`` when its content is complete."""
     wanted = home / output
     part = wanted.with_name(f".{wanted.name[:100]}.{secrets.token_hex(4)}{PART}")
     try:
@@ -347,7 +359,7 @@ def _make_part(output: Path, home: Path) -> Path:
 
 
 def _free(output: Path, home: Path) -> Path:
-    """``output``, or the first of ``output-2``, ``-3``, … that does not exist."""
+    """Return ``output``, or the first of ``output-2``, ``output-3``, … if ``output`` exists."""
     number, path = 1, output
     while os.path.lexists(home / path):
         number += 1
@@ -356,9 +368,10 @@ def _free(output: Path, home: Path) -> Path:
 
 
 def _claim(part: Path, output: Path, home: Path) -> Path:
-    """Rename the folder to the first free name.
+    """Rename the folder to the first free name, and return this name.
 
-    Two concurrent runs cannot get the same name: the folders are not empty, so the second rename fails.
+    Two concurrent runs cannot get the same name: folders of runs are not empty, and renaming to a folder that is not
+    empty fails.
     """
     while True:
         path = _free(output, home)
@@ -376,7 +389,10 @@ def _not_made(output: Path, error: OSError) -> str:
 
 @contextlib.contextmanager
 def _opened(folder: Path) -> Iterator[int | None]:
-    """Descriptor of the folder, valid even if it is renamed; None if it cannot be opened (Windows, no permission)."""
+    """Yield a descriptor of a folder, which stays valid if the folder is renamed.
+
+    Yields None if the folder cannot be opened (Windows, no permission).
+    """
     with contextlib.ExitStack() as stack:
         descriptor = None
         if os.unlink in os.supports_dir_fd:
@@ -387,7 +403,7 @@ def _opened(folder: Path) -> Iterator[int | None]:
 
 
 def _identity(path: Path | int) -> tuple[int, int] | None:
-    """Device and inode of a folder, given by path or descriptor; None if it does not exist."""
+    """Return device and inode of a folder, given by path or descriptor; None if the folder does not exist."""
     try:
         status = os.stat(path)
     except OSError:
@@ -396,13 +412,19 @@ def _identity(path: Path | int) -> tuple[int, int] | None:
 
 
 def _is_link(path: Path, descriptor: int | None) -> bool:
-    """Whether the path, relative to the open folder if there is one, is a link. Raises OSError if it does not exist."""
+    """Return whether a path is a symbolic link. Raises OSError if the path does not exist.
+
+    The path is relative to the open folder ``descriptor``, if there is one.
+    """
     return stat.S_ISLNK(os.stat(path, dir_fd=descriptor, follow_symlinks=False).st_mode)
 
 
 def _write_through(path: Path, content: Content, descriptor: int | None) -> None:
-    """Write a file and wait until it is on disk; the path is relative to the open folder if there is one."""
-    # Remove what a killed run has left; a link of that name is not followed.
+    """Write a file, and wait until it is on disk.
+
+    The path is relative to the open folder ``descriptor``, if there is one.
+    """
+    # Remove the file or link of this name that a killed run may have left.
     with contextlib.suppress(FileNotFoundError):
         os.unlink(path, dir_fd=descriptor)
     with open(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o666, dir_fd=descriptor)) as file:

@@ -1,4 +1,4 @@
-"""Saves a run in its folder: first files, periodic checkpoints, and restoring from them."""
+"""Saves a run in its folder as first files and periodic checkpoints, and restores runs from these files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pathreplay.platform.files import file_problem
 from pathreplay.runs.run_folder import BASELINE_CHECKPOINT, CHECKPOINT, RunFolder
 
 CAPTURE = "capture.sha256"
-"""Hash of the capture's cameras, by which a later change is detected."""
+"""File with a hash of the capture's cameras, to detect a change of the cameras before a run is resumed."""
 
 
 class Saving:
@@ -44,15 +44,15 @@ class Saving:
             self._write(event.done)
 
     def close(self) -> None:
-        """Save iterations that are not saved yet. Raises as `observe` does."""
+        """Save iterations that are not saved yet. Raises the same errors as `observe`."""
         if self._runs_are_whole() and len(self.run.history) > self.saved:
             self._write(len(self.run.history))
 
     def rescued(self) -> bool:
-        """Save the remaining iterations after an error of the run; returns whether all iterations are saved now."""
+        """Save the remaining iterations after an error of the run, and return whether all iterations are saved."""
         if not self._runs_are_whole() or not self.run.history:
             return False
-        with contextlib.suppress(PathreplayError):  # the first error is the one to report
+        with contextlib.suppress(PathreplayError):  # the caller reports the error of the run
             self.close()
         return self.saved == len(self.run.history)
 
@@ -65,9 +65,9 @@ class Saving:
 
 
 def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, Content]:
-    """Files from which a run can be resumed, by name: targets, initial images, their checksums, and checkpoints.
+    """Return the first files of a run, by name: targets, weights, initial images, their checksums, and checkpoints.
 
-    ``before`` are the images of the initial values by view name.
+    The run can be resumed from these files. ``before`` are the images at the initial values by view name.
     """
     pictures = {_picture("target", view.name): view.target for view in problem.views}
     pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}
@@ -79,7 +79,7 @@ def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict
 
 
 def saved_targets(folder: Path) -> Targets:
-    """Read the targets of a run folder. Raises PathreplayError if one differs from its checksum."""
+    """Read the targets and weights of a run folder. Raises PathreplayError if a file differs from its checksum."""
     sums = Sums(folder)
     images, weights = (
         {path.stem.removeprefix(f"{kind}-"): _read(path, sums) for path in sorted(folder.glob(_picture(kind, "*")))}
@@ -89,11 +89,19 @@ def saved_targets(folder: Path) -> Targets:
 
 
 def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) -> dict[str, Image]:
-    """Restore a run from the folder's checkpoint; returns the images of its initial values by view name.
+    """Restore a run from the checkpoint in its folder.
 
-    ``held`` are variables that some stages keep fixed.
+    Args:
+        folder: the run folder.
+        problem: the problem of the run.
+        run: the run to restore, which is modified.
+        held: keys of variables that stages may freeze.
 
-    Raises PathreplayError if an image or a checkpoint is missing, damaged, or does not fit this run.
+    Returns:
+        The images at the initial values by view name.
+
+    Raises:
+        PathreplayError: an image or a checkpoint is missing, damaged, or does not fit this run.
     """
     _require_capture(folder / CAPTURE, problem)
     keep, sums = problem.disk.keep, Sums(folder)

@@ -1,1 +1,1 @@
-"""Pages for the browser: their content as plain data, and the HTML document made from it."""
+"""Pages for the browser: their content as plain data, and the conversion of the content to HTML."""

@@ -1,4 +1,4 @@
-"""Renders a page as one HTML document with its own style and script; a CSP forbids requests to other hosts."""
+"""Renders a page as one HTML document with inline style and script; its CSP forbids requests to other hosts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _file(name: str) -> str:
 
 @cache
 def template(name: str) -> jinja2.Template:
-    """Load one of this package's templates, which escape inserted texts."""
+    """Load a template of this package. Inserted texts are escaped."""
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_file),
         autoescape=True,
@@ -35,8 +35,8 @@ def template(name: str) -> jinja2.Template:
 def document(page: Page, live: bool = False) -> bytes:
     """Render the page as HTML in UTF-8.
 
-    A ``live`` page is served: it polls for updates and has a button to stop the run. A saved page contains its content
-    security policy; for a served page, the server sends `policy` in a header.
+    A ``live`` page is served by `watch`: it polls for updates, and has a button to stop the run. A saved page contains
+    its content security policy. For a live page, the server sends the policy in a header.
     """
     html = template("page.html.j2").render(
         page=page, live=live, policy="" if live else policy("data:"), data=_data(page, live),
@@ -46,7 +46,12 @@ def document(page: Page, live: bool = False) -> bytes:
 
 
 def policy(pictures: str, connect: str = "'none'") -> str:
-    """Content-Security-Policy that allows our style and script, and images from the source ``pictures``."""
+    """Return a Content-Security-Policy that allows only this package's style and script, and the given sources.
+
+    Args:
+        pictures: allowed sources of images.
+        connect: allowed targets of requests by the script.
+    """
     rules = {
         "default-src": "'none'",
         "script-src": _hash("page.js"),
@@ -64,7 +69,7 @@ def _hash(name: str) -> str:
 
 
 def _data(page: Page, live: bool) -> str:
-    """Data of the script, as JSON that cannot close the enclosing HTML element."""
+    """Return the data for the script as JSON that cannot close the enclosing HTML element."""
     data = {
         "live": live,
         "exposure": page.exposure,

@@ -1,20 +1,20 @@
 """The content of a page about a run as plain data, from which `document` makes HTML.
 
-The document shows all texts literally. A ``src`` is a data URI in a self-contained page, and a relative address in a
-served page.
+The document shows all texts literally. The ``src`` of an image is a data URI in a self-contained page, and a relative
+address in a served page.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-# Maximum points of a curve; longer curves are subsampled.
+# Maximum number of points of a curve. Longer curves are subsampled.
 MOST_POINTS = 1500
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image of one kind, as 'target' or 'result', with its caption."""
+    """An image with its caption. ``kind`` is a name such as 'target' or 'result'."""
 
     kind: str
     caption: str
@@ -31,7 +31,10 @@ class Still:
 
 @dataclass(frozen=True)
 class View:
-    """Images of one view. ``stored`` is the exposure of the stored images, ``own`` the view's own best exposure."""
+    """Images of one view.
+
+    ``stored`` is the exposure with which the images are encoded, and ``own`` the best exposure for this view.
+    """
 
     name: str
     pictures: tuple[Picture, ...]
@@ -53,7 +56,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Head:
-    """A column header: words, optionally followed by a parameter key."""
+    """A column header: a text, optionally followed by a parameter key (``code``)."""
 
     text: str
     code: str = ""
@@ -61,7 +64,7 @@ class Head:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under column headers; the first header is that of the row names."""
+    """Rows under column headers. The first header belongs to the row names."""
 
     heads: tuple[Head, ...]
     rows: tuple[Row, ...]
@@ -69,7 +72,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Mesh:
-    """An interactive mesh: vertices by kind (3 n float32, base64), and faces (3 m uint32, base64)."""
+    """An interactive mesh: vertices by kind (3n float32, base64), and vertex indices of faces (3m uint32, base64)."""
 
     vertices: dict[str, str]
     faces: str
@@ -77,7 +80,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Parameter:
-    """The section of one parameter: any of images, table rows, a note, a film and a mesh."""
+    """The section about one parameter, with optional images, table rows, note, film and mesh."""
 
     key: str
     pictures: tuple[Picture, ...] = ()
@@ -90,7 +93,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Series:
-    """A line of a plot, named if there are several. Unknown values are None."""
+    """A line of a plot. ``name`` is "" if the plot has only one line. Unknown values are None."""
 
     name: str
     x: tuple[float, ...]
@@ -99,7 +102,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves, usually over iterations; on a logarithmic scale if ``log`` is set and all values are positive."""
+    """Curves, usually over iterations. The scale is logarithmic if ``log`` is set and all values are positive."""
 
     title: str
     series: tuple[Series, ...]
@@ -126,7 +129,7 @@ class Page:
 
     title: str
     lead: tuple[str, str, str]
-    """Text, a name in a monospace font, and text."""
+    """Three parts of a sentence: text, a name in a monospace font, and text."""
     notices: tuple[str, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
     comparison: Comparison | None = None
@@ -135,10 +138,10 @@ class Page:
     likeness_note: str = ""
     views_note: str = ""
     exposure: float = 1.0
-    """Common exposure of all views, unless the reader chooses a view's own."""
+    """Display exposure of all views, unless the reader chooses the best exposure of each view."""
     left: str = "target"
     right: str = "result"
-    """Initial images of the wipe comparison."""
+    """``left`` and ``right`` are the kinds of the images that the wipe comparison shows at first."""
     plots: tuple[Plot, ...] = ()
     plots_note: str = ""
     drawing: str = ""
@@ -152,6 +155,6 @@ class Page:
 
 
 def thinned(count: int, most: int = MOST_POINTS) -> list[int]:
-    """Indices of the drawn points of a sequence: all, or evenly subsampled ones and the last."""
+    """Return the indices at which a sequence is drawn: all, or about ``most`` evenly spaced indices and the last."""
     step = -(-count // most) or 1
     return [*range(0, count - 1, step), count - 1] if count else []

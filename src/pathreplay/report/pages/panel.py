@@ -1,4 +1,4 @@
-"""The progress panel of a run in a notebook, as HTML that needs no script."""
+"""The progress panel of a run in a notebook, as HTML without scripts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Panel:
     notes: tuple[str, ...] = ()
 
     def html(self) -> str:
-        """Render the panel. The curve is subsampled, and logarithmic if all losses are positive."""
+        """Render the panel as HTML. The loss curve is subsampled, and logarithmic if all losses are positive."""
         losses = [self.losses[i] for i in thinned(len(self.losses), MOST_POINTS)]
         log = bool(losses) and min(losses) > 0
         return template("panel.html.j2").render(
@@ -38,7 +38,7 @@ class Panel:
 
 
 def _points(values: list[float]) -> str:
-    """Points of a polyline through the values, in pixels; "" for fewer than two values."""
+    """Return the points of an SVG polyline through the values, in pixels; "" for fewer than two values."""
     if len(values) < 2:
         return ""
     low, high = min(values), max(values)

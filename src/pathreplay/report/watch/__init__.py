@@ -1,1 +1,1 @@
-"""Inspects runs: a local page that follows a run, comparisons, films, and export to TensorBoard."""
+"""Inspects saved and active runs: a local live page, comparisons, films, and export to TensorBoard."""

@@ -1,4 +1,4 @@
-"""Compares runs: a table of their results and of the differences of their jobs, and a page of curves and images."""
+"""Compares runs by a table of their results and of differences between their jobs, and a page of curves and images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ from pathreplay.report.watch.run_files import read_own
 
 
 def table(runs: list[Past]) -> Table:
-    """One column per run: iterations, seconds, loss, image metrics, errors, and job keys whose values differ."""
+    """Return a table with one column per run.
+
+    Rows: iterations, seconds, loss, image metrics, errors, and the job keys whose values differ.
+    """
     rows = [
         Row("iterations", tuple(f"{len(run.history)} of {run.config.iterations}" for run in runs)),
         Row("seconds", tuple(f"{sum(entry.seconds for entry in run.history):.1f}" for run in runs)),
@@ -37,7 +40,7 @@ def table(runs: list[Past]) -> Table:
 
 
 def page(runs: list[Past]) -> Page:
-    """A page with the table, curves, and images of the views that all runs have."""
+    """Return a page with the table, curves, and images of the views that all runs have."""
     kinds = {run.config.loss for run in runs}
     notice = "" if len(kinds) == 1 else f"The runs minimize different losses ({', '.join(sorted(kinds))})."
     views = _views(runs)
@@ -80,12 +83,12 @@ def _last(run: Past) -> Mapping[str, float]:
 
 
 def _keys(tables: Iterable[Mapping[str, object]]) -> list[str]:
-    """The distinct keys of all tables, in order of first occurrence."""
+    """Return the distinct keys of all tables, in order of first occurrence."""
     return list(dict.fromkeys(itertools.chain.from_iterable(tables)))
 
 
 def _differences(runs: list[Past]) -> list[Row]:
-    """Rows of the job keys whose values differ, except for ``output``."""
+    """Return a row for each job key whose values differ, except ``output``."""
     jobs = [dict(_flattened("", run.config.model_dump())) for run in runs]
     for job in jobs:
         job.pop("output", None)
@@ -170,7 +173,7 @@ def _parameters(runs: list[Past]) -> tuple[Parameter, ...]:
 
 
 def _picture(run: Past, kind: str, caption: str, file: str, most_pixels: float) -> Picture | None:
-    """Read one of a run's images, downscaled to ``most_pixels``; None if it does not exist."""
+    """Read an image of a run, and reduce it to ``most_pixels``; None if the image does not exist."""
     data = read_own(run.folder / "images" / f"{file}.png")
     if data is None:
         return None
@@ -192,7 +195,7 @@ def _picture(run: Past, kind: str, caption: str, file: str, most_pixels: float) 
 
 
 def print_table(it: Table) -> None:
-    """Print the table on the terminal, without interpreting its texts as markup."""
+    """Print a table on the terminal, without interpreting its texts as markup."""
     from rich.console import Console
     from rich.table import Table as Drawn
     from rich.text import Text

@@ -1,4 +1,4 @@
-"""Reads a finished or active run from its folder: job, history and results."""
+"""Reads the job, history and results of a finished or active run from its folder."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ _HISTORY = TypeAdapter(list[Entry])
 
 @dataclass(frozen=True)
 class Past:
-    """A run in a folder; ``name`` distinguishes it from the other inspected runs."""
+    """A run in a folder. ``name`` differs from the names of the other inspected runs."""
 
     folder: Path
     name: str
 
     @cached_property
     def config(self) -> Config:
-        """Config of the job. Raises PathreplayError if it cannot be read."""
+        """Config of the job. Raises PathreplayError if the config cannot be read."""
         return read_job(self.folder).config
 
     @cached_property
     def history(self) -> list[Entry]:
-        """Iterations up to the last checkpoint. Raises PathreplayError if that is missing or damaged."""
+        """Iterations up to the last checkpoint. Raises PathreplayError if the checkpoint is missing or damaged."""
         path = self.folder / CHECKPOINT
         try:
             with safetensors.safe_open(str(path), framework="numpy") as file:
@@ -47,12 +47,12 @@ class Past:
 
     @cached_property
     def views(self) -> dict[str, Json]:
-        """Entries of views.json by view; empty before the end of the run."""
+        """Entries of views.json by view name; empty before the end of the run."""
         table = self._json("views.json")
         return table if all(isinstance(view, dict) for view in table.values()) else {}
 
     def likeness(self, view: str, kind: str) -> float | None:
-        """PSNR or SSIM of a view in the result; None if unknown."""
+        """Return an image metric ('psnr' or 'ssim') of the result of a view; None if unknown."""
         result = self.views.get(view, {}).get("result")
         value = result.get(kind) if isinstance(result, dict) else None
         return float(value) if isinstance(value, (int, float)) else None
@@ -69,7 +69,10 @@ class Past:
 
 
 def pasts(folders: list[Path]) -> list[Past]:
-    """The runs in these folders, with distinct names. Raises PathreplayError if a folder is not a run folder."""
+    """Return the runs in these folders, with distinct names.
+
+    Raises PathreplayError if a folder is not a run folder, or is given twice.
+    """
     names = [folder.resolve().name for folder in folders]
     runs = []
     for folder, name in zip(folders, names, strict=True):

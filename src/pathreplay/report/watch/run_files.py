@@ -1,4 +1,4 @@
-"""Files of a run folder that `watch` serves: its live page or report and its images; and the run's process."""
+"""Reads the files of a run folder that `watch` serves (live page or report, images), and finds the run's process."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from pathreplay.report.pages.page import Page
 from pathreplay.runs.folder_lock import LOCK
 
 REPORT = "report.html"
-# Far more than any of these files needs.
+# Limit of a file, which is far larger than any of these files.
 MOST_BYTES = 256 * 2**20
 PICTURES = {".png": "image/png", ".webp": "image/webp"}
 
 
 def require_run(run: Path) -> None:
-    """Raise PathreplayError if the folder has nothing to show."""
+    """Raise PathreplayError if the folder is not a run folder, or has no page and no report yet."""
     if not run.is_dir():
         raise PathreplayError(f"No run folder {run}; give a folder that optimize has created")
     if not (run / "run.json").is_file():
@@ -34,7 +34,10 @@ def require_run(run: Path) -> None:
 
 
 def read_own(path: Path) -> bytes | None:
-    """Content of a regular file of the run; None if it does not exist, is a link, or is too large."""
+    """Return the content of a file; None if the file does not exist, is not a regular file, or is too large.
+
+    Symbolic links are not followed.
+    """
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         with open(os.open(path, flags), "rb") as file:
@@ -45,7 +48,7 @@ def read_own(path: Path) -> bytes | None:
 
 
 def picture(run: Path, name: str) -> tuple[str, bytes] | None:
-    """Media type and content of a preview image; None if it does not exist or is outside the previews."""
+    """Return media type and content of a preview image; None if it does not exist, or is not in ``previews``."""
     kind = PICTURES.get(Path(name).suffix)
     if kind is None or not re.fullmatch(r"[\w.-]+", name) or (run / FOLDER).is_symlink():
         return None
@@ -54,7 +57,7 @@ def picture(run: Path, name: str) -> tuple[str, bytes] | None:
 
 
 def report(run: Path) -> bytes | None:
-    """The report, if the run has ended with one, which is then newer than the live page."""
+    """Return the report, if the run has ended with one. The report is then newer than the live page."""
     with contextlib.suppress(OSError):
         written = (run / REPORT).stat().st_mtime_ns
         with contextlib.suppress(FileNotFoundError):
@@ -65,7 +68,7 @@ def report(run: Path) -> bytes | None:
 
 
 def page(run: Path) -> Page:
-    """Read the live page of the run. Raises PathreplayError if it is damaged."""
+    """Read the live page of a run. Raises PathreplayError if the page is missing or damaged."""
     path = run / PAGE
     if problem := file_problem(path, MOST_BYTES):
         raise PathreplayError(f"{path} {problem}; wait for the run to write it")
@@ -78,7 +81,10 @@ def page(run: Path) -> Page:
 
 
 def holder(run: Path) -> str | None:
-    """The process that holds the run's lock, as far as this machine can tell; None if it has ended."""
+    """Return the process of the run, which is written in its lock file; None if the process has ended.
+
+    Processes on other machines cannot be checked, and count as running.
+    """
     data = read_own(run / LOCK) or b""
     match = re.fullmatch(r"(\d+) ([\w.-]+)\s*", data.decode("ascii", "replace"))
     if match is None:
@@ -94,8 +100,8 @@ def holder(run: Path) -> str | None:
 
 
 def ask_to_stop(run: Path) -> None:
-    """Create the file that asks the run to stop. Raises PathreplayError if it cannot be written."""
-    # Opening must not block, even if the name belongs to a pipe that nobody reads.
+    """Create the file that requests a stop of the run. Raises PathreplayError if the file cannot be written."""
+    # Opening must not block, even if there is a pipe of this name that nobody reads.
     flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         os.close(os.open(run / STOP, flags, 0o644))

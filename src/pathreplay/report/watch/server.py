@@ -1,7 +1,7 @@
-"""A small server for one run: its page, the images of the page, and a request to stop the run.
+"""An HTTP server for one run, with its page, the images of the page, and a request to stop the run.
 
-All addresses begin with a token that only the user who started the server knows. Requests by a page of another host
-whose name resolves to this machine (DNS rebinding) are refused by their Host header.
+All paths begin with a token that only the user who started the server knows. The Host header of each request is
+checked, to refuse pages of another host whose name resolves to this machine (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 Request: TypeAlias = "socket.socket | tuple[bytes, socket.socket]"
 
-# Seconds within which a client must send its request and receive the answer.
+# Seconds within which a client must send its request. Also the timeout of sending the answer.
 PATIENCE = 30
-# Maximum concurrent connections, enough for several browsers. Further ones are closed.
+# Maximum number of concurrent connections, which is enough for several browsers. Further connections are closed.
 MOST = 32
 
 
 class RunServer(ThreadingHTTPServer):
-    """Serves ``run`` at ``address``, a URL with a token in it, until `shutdown`."""
+    """Serves a run at ``address``, which is a URL with a token, until `shutdown`."""
 
     daemon_threads = True
     request_queue_size = MOST
@@ -62,14 +62,14 @@ class RunServer(ThreadingHTTPServer):
         self.address = f"http://{shown}:{self.server_address[1]}/{self.token}/"
 
     def process_request(self, request: Request, client_address: object) -> None:
-        """Answer in a thread of its own, or close the connection if there are too many."""
+        """Answer in a new thread, or close the connection if there are too many connections."""
         if not self.room.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Request, client_address: object) -> None:
-        """Answer, then release the connection's slot."""
+        """Answer, and then release the slot of the connection."""
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -81,7 +81,7 @@ class RunServer(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
     def knows(self, host: str) -> bool:
-        """Whether a request with this Host header may be answered: a numeric address, or a name of this machine."""
+        """Return whether a Host header is a numeric address or a name of this machine; other requests are refused."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:
@@ -93,7 +93,7 @@ class RunServer(ThreadingHTTPServer):
 
 
 class _Within(io.RawIOBase):
-    """Reads from a client up to a deadline, after which it raises TimeoutError even if bytes keep arriving slowly."""
+    """Reads from a client, and raises TimeoutError after a deadline, even if bytes keep arriving slowly."""
 
     def __init__(self, connection: socket.socket, seconds: float) -> None:
         self.connection, self.end = connection, time.monotonic() + seconds
@@ -103,7 +103,7 @@ class _Within(io.RawIOBase):
         return True
 
     def readinto(self, buffer: WriteableBuffer) -> int:
-        """Wait for bytes until the deadline."""
+        """Read bytes. Raises TimeoutError after the deadline."""
         if (left := self.end - time.monotonic()) <= 0:
             raise TimeoutError
         self.connection.settimeout(left)
@@ -114,7 +114,7 @@ class _Within(io.RawIOBase):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answers one request per connection; anything sent after it is never read."""
+    """Answers one request per connection. Data after the request is never read."""
 
     server: RunServer
     timeout = PATIENCE
@@ -154,14 +154,14 @@ class Handler(BaseHTTPRequestHandler):
             self._answer(200, "text/plain", b"stopping\n")
 
     def _from_our_page(self) -> bool:
-        """Whether the request does not come from a page of another origin."""
+        """Return whether the Origin header, if there is one, names this server."""
         origin = self.headers.get("Origin")
-        with contextlib.suppress(ValueError):  # not a URL
+        with contextlib.suppress(ValueError):  # the Origin header is not a URL
             return origin is None or urlsplit(origin).netloc == self.headers.get("Host")
         return False
 
     def _place(self) -> str | None:
-        """Return the requested path after the token. If the request is refused, answer it and return None."""
+        """Return the requested path after the token. Answer a request that is refused, and return None."""
         if not self.server.knows(self.headers.get("Host", "")):
             self._answer(403, "text/plain", b"unknown host name\n")
             return None
@@ -174,7 +174,7 @@ class Handler(BaseHTTPRequestHandler):
         if not secrets.compare_digest(token.encode("utf-8", "replace"), self.server.token.encode()):
             self._answer(403, "text/plain", b"use the full address that pathreplay watch printed\n")
             return None
-        if not slash:  # relative addresses of the page would not resolve
+        if not slash:  # the browser would not resolve the page's relative addresses correctly
             self._answer(404, "text/plain", b"the address must end with a /\n")
             return None
         return place

@@ -1,4 +1,4 @@
-"""Writes the history of a run for TensorBoard: loss, errors and gradient norms per iteration, with their times."""
+"""Writes the history of a run for TensorBoard: loss, errors and gradient norms by iteration and time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathreplay.report.watch.past import Past
 
 
 def write_events(run: Past, output: Path) -> int:
-    """Write event files into a folder in ``output`` that is named like the run; returns the number of iterations.
+    """Write event files into a subfolder of ``output`` with the name of the run; return the number of iterations.
 
     Raises PathreplayError if the package tensorboard is missing, or the folder exists or cannot be written.
     """

@@ -1,4 +1,4 @@
-"""Makes a film of a run: the target beside the current image, iteration by iteration, as WebP or MP4."""
+"""Makes a film of a run as WebP or MP4, which shows the target beside the current image after several iterations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.report.live_page import FOLDER, frames
 from pathreplay.report.watch.run_files import read_own
 
-# Heights in pixels: of the images, and of the line of text below them.
+# Height of the images, and of the line of text below the images, in pixels.
 HEIGHT, TEXT = 288, 24
 # Maximum number of textures and volumes beside the view.
 MOST_BESIDE = 2
@@ -24,9 +24,20 @@ KINDS = (".webp", ".mp4")
 
 
 def film(run: Path, output: Path, view: str | None = None, seconds: float = 6.0) -> int:
-    """Write a film of ``view`` (default: the first) that takes ``seconds`` to ``output``; returns its frame count.
+    """Write a film of a run.
 
-    Raises PathreplayError if the run has no frames, the file type is unknown, or MP4 is requested without ffmpeg.
+    Args:
+        run: run folder.
+        output: file to write: .webp or .mp4.
+        view: name of the view; default: the first view with frames.
+        seconds: duration of the film.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        PathreplayError: the run has no frames, the file cannot be written, its type is unknown, or MP4 is requested
+            without ffmpeg.
     """
     if output.suffix.lower() not in KINDS:
         raise PathreplayError(f"--output {output} is neither .webp nor .mp4; give a name with one of these endings")
@@ -71,18 +82,21 @@ def _pictures(run: Path, view: str | None) -> list[PIL.Image.Image]:
         now = {"target": target, f"after {i} iterations": _opened(by_what[f"view-{chosen}"][i])}
         now |= {what.split("-", 1)[1]: _opened(by_what[what][i]) for what in beside}
         sheets.append(now)
-    # Refined grids had lower resolutions before; all frames of a film have the same size.
+    # Frames of a refined grid have different resolutions. All images are scaled to the size of the last frame.
     sizes = [(max(2, round(p.width * HEIGHT / p.height)), HEIGHT) for p in sheets[-1].values()]
     return [_side_by_side(now, sizes) for now in sheets]
 
 
 def _side_by_side(pictures: Mapping[str, PIL.Image.Image], sizes: list[tuple[int, int]]) -> PIL.Image.Image:
-    """Images in these sizes with a label below each; the frame's sides are even, as video encoders require."""
+    """Draw images in these sizes, with a label below each image, into one frame.
+
+    The frame's width and height are even, as video encoders require.
+    """
     width = sum(w for w, _ in sizes) + 4 * (len(sizes) - 1)
     sheet = PIL.Image.new("RGB", (width + width % 2, HEIGHT + TEXT), (20, 23, 27))
     draw, font, x = PIL.ImageDraw.Draw(sheet), PIL.ImageFont.load_default(14), 0
     for (name, picture), size in zip(pictures.items(), sizes, strict=True):
-        # Enlarged texels stay square; reduced images are averaged.
+        # Enlarge without interpolation, so that texels stay square, and reduce by averaging.
         kind = PIL.Image.Resampling.NEAREST if picture.height <= HEIGHT else PIL.Image.Resampling.BOX
         sheet.paste(picture.resize(size, kind), (x, 0))
         draw.text((x + 4, HEIGHT + 3), name[: max(4, size[0] // 8)], fill=(231, 234, 238), font=font)
