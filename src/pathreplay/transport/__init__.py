@@ -1,1 +1,1 @@
-"""The differentiable step of a path at one vertex: arrival, next-event estimation, scattering, and attachment."""
+"""The differentiable step of a path at one vertex: arrival, next-event estimation, scattering, and motion."""

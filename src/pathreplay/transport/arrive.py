@@ -1,7 +1,7 @@
-"""Arrive: evaluate the end of a ray, the radiance emitted along the ray, and the flight before it.
+"""Arrive: evaluate the end point of a ray, the emission seen along the ray, and the free flight up to the end point.
 
-With media a ray may end at a scattering event inside a medium, and the flight has its own weight and emission. Without
-media a ray ends at a surface or leaves the scene.
+Without media, a ray ends at a surface or leaves the scene. With media, a ray may also end at a collision inside a
+medium, and the free flight has a weight and emission of its own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathreplay.transport.volume.media import interaction
 
 @dataclass
 class Vertex:
-    """The vertex that a path arrived at: a scattering surface, a medium event, or a place where nothing scatters."""
+    """The vertex at the end of a ray: a scattering surface, a collision in a medium, a null boundary, or a miss."""
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
@@ -37,21 +37,21 @@ class InMedium:
     """The additional state of a vertex in a scene with media."""
 
     event: mi.Bool  # the flight ended at a real collision in the medium
-    through: mi.Bool  # a null boundary, which all light crosses unscattered; it does not count as a vertex
+    through: mi.Bool  # the ray ended at a null boundary, which passes all light and does not count as a vertex
     mei: mi.MediumInteraction3f
     phase: mi.PhaseFunctionPtr
     flight: Flight
-    w: mi.Spectrum  # weight of all radiance from the vertex: transmittance, times σ_s / density at a medium event
+    w: mi.Spectrum  # weight of the radiance from the vertex: flight.W, times σ_s / density at a collision
     e: mi.Spectrum  # radiance emitted by the medium along the flight
 
 
 def choose(
     trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, active: mi.Bool, flight: Flight | None = None
 ) -> Vertex:
-    """Arrive in the sampling pass. Nothing is differentiated.
+    """Evaluate an arrival in the sampling pass. Nothing is differentiated.
 
-    With media, sample the flight from ``sampler`` unless ``flight`` is given. The throughput ``β`` determines the
-    probability that a collision is real, see `fly`.
+    With media, the flight is sampled from ``sampler`` unless ``flight`` is given. The throughput ``β`` affects the
+    probability that a collision is real (see `fly`).
     """
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
     if trace.steady_frames:
@@ -67,10 +67,10 @@ def choose(
 
 
 def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Vertex:
-    """Arrive again, differentiably in emission and the coefficients of media.
+    """Evaluate a recorded arrival again, differentiable in emission and the coefficients of media.
 
-    If ``attached``, the hit point follows the ray and the shape, and the MIS weight of the emission follows the density
-    of the ray.
+    If ``attached``, the hit point is also differentiable in the ray and the shape, and the MIS weight of the emission
+    is differentiable in the density of the ray.
     """
     at, kept = again.at, again.kept
     with dr.suspend_grad(when=not attached):
@@ -88,7 +88,7 @@ def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.B
 
 
 def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
-    """Return the radiance along rays that ``left`` the scene, MIS weighted; differentiable in the environment."""
+    """Return the MIS-weighted environment radiance along rays that ``left`` the scene, differentiably."""
     if trace.scene.environment() is None:
         return mi.Spectrum(0)
     si = dr.zeros(mi.SurfaceInteraction3f)
@@ -97,7 +97,7 @@ def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
 
 
 def sees_lights(trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Return the lanes that count emission at a ray's end: ``hide_emitters`` hides the environment from the camera."""
+    """Return the lanes in which emission counts: all, except camera rays that miss if ``hide_emitters`` is set."""
     return active & (~at.camera | si.is_valid()) if trace.hide_emitters else active
 
 

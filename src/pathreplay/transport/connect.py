@@ -20,16 +20,16 @@ class Connection:
     """An emitter sample as seen from a vertex."""
 
     light: mi.DirectionSample3f
-    Le: mi.Spectrum  # emitted radiance over density, times the transmittance in between
+    Le: mi.Spectrum  # emitted radiance over density, times the transmittance between emitter and vertex
     lit: mi.Bool  # the sample is valid and unoccluded
     shadow: Shadow = None  # type: ignore[assignment]  # None in scenes without media
 
     def mis(self, pdf: mi.Float) -> mi.Float:
-        """Return the MIS weight of the sample; ``pdf`` is the density of sampling its direction at the vertex."""
+        """Return the MIS weight; ``pdf`` is the density with which the vertex samples the direction to the emitter."""
         return dr.select(self.light.delta, 1, mis_weight(self.light.pdf, pdf))
 
     def reaches(self, pdf: mi.Float, attached: bool) -> mi.Spectrum:
-        """Return the MIS-weighted radiance at the vertex (Spectrum); ``pdf`` is the density of its direction there."""
+        """Return the MIS-weighted radiance that reaches the vertex (Spectrum); for ``pdf`` see `mis`."""
         mis = self.mis(pdf)
         # The MIS weights of a detached path need no derivative: they sum to one for all values of the parameters.
         return self.Le * (mis if attached else dr.detach(mis))
@@ -38,9 +38,9 @@ class Connection:
 def choose(
     trace: TraceConfig, v: Vertex, medium: mi.MediumPtr, u: VertexSamples, sampler: Sampler, go_on: mi.Bool
 ) -> Connection:
-    """Sample an emitter where the vertex can scatter its light, and with media trace a shadow ray. Detached.
+    """Sample an emitter, in lanes whose vertex can scatter light from emitter samples, and test visibility. Detached.
 
-    The shadow ray starts in ``medium``.
+    With media, a shadow ray estimates the transmittance. ``medium`` is the medium through which the path arrived.
     """
     if v.inside is None:
         lit = go_on & v.surface & is_smooth(v.bsdf)
@@ -56,14 +56,14 @@ def choose(
 
 
 def shadow_start(v: Vertex, light: mi.DirectionSample3f, medium: mi.MediumPtr) -> mi.MediumPtr:
-    """Return the medium in which a shadow ray starts, if the path arrived through ``medium``."""
+    """Return the medium in which a shadow ray starts; ``medium`` is the medium through which the path arrived."""
     return dr.select(v.surface & v.si.is_medium_transition(), v.si.target_medium(light.d), medium)
 
 
 def repeat(trace: TraceConfig, v: Vertex, again: VertexRecord, ctx: mi.BSDFContext, attached: bool) -> mi.Spectrum:
-    """Evaluate the contribution of the recorded emitter sample to e again (Spectrum), differentiably.
+    """Evaluate the next-event estimate of the recorded emitter sample again (Spectrum), differentiably.
 
-    If ``attached``, the point on the emitter follows the emitter. Visibility is not differentiated.
+    If ``attached``, the point on the emitter moves with the emitter. Visibility is not differentiated.
     """
     kept = again.kept
     if kept.known is not None and not attached:

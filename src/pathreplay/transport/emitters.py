@@ -38,7 +38,7 @@ def vertex_glow(
 
 
 def relight(trace: TraceConfig, at: Arrival, lighting: Lighting) -> mi.Spectrum:
-    """Evaluate e of a recorded vertex again (Spectrum), differentiable in emitted radiance only."""
+    """Evaluate emission plus next-event estimate of a vertex again (Spectrum); differentiable in emitted radiance."""
     own = vertex_glow(trace, at, lighting.si, False, lighting.seen)
     return own + lighting.w * trace.scene.eval_emitter_direction(lighting.si, lighting.light, lighting.lit)
 
@@ -63,11 +63,12 @@ def redraw_emitter(
     attached: bool,
     lit: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """Evaluate the emitter sample of the sampling pass again, differentiably; return it with Le/p.
+    """Evaluate the emitter sample of the sampling pass again, differentiably; return the sample with Le/p.
 
-    ``light`` is the sample itself if it is still available, else None. If ``attached``, the point keeps its coordinates
-    on the emitter and so moves with it, and direction, distance and density follow. Otherwise the point is fixed in
-    space and only the emitted radiance is differentiated. Visibility is never differentiated.
+    ``light`` is the original sample, or None if it is not available. If ``attached``, the sampled point has fixed
+    coordinates on the emitter and moves with the emitter; direction, distance and density are differentiated as well.
+    Otherwise the point is fixed in space, and only the emitted radiance is differentiated. Visibility is never
+    differentiated.
     """
     scene = trace.scene
     if attached:
@@ -90,10 +91,10 @@ def redraw_emitter(
 def _glued(
     trace: TraceConfig, origin: mi.Interaction3f, still: mi.DirectionSample3f, active: mi.Bool
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """Sample a textured emissive mesh at a point with fixed barycentric coordinates, and return it with Le/p.
+    """Attach a sample on a textured emissive mesh to fixed barycentric coordinates; return the sample with Le/p.
 
-    ``still`` is the same sample, detached. Mitsuba's own sample slides over the mesh: Mitsuba intersects the mesh with
-    a ray in the plane of texture coordinates.
+    ``still`` is the detached sample. Mitsuba samples such a mesh by intersecting it in texture space, and its own
+    attached sample would slide over the mesh.
     """
     ray = dr.detach(origin.spawn_ray_to(still.p))
     ray.maxt = dr.largest(mi.Float)
@@ -117,9 +118,9 @@ def _glued(
 
 
 def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:
-    """Return the area of the sampled emissive triangle over its detached value: 1, with the derivative of log area.
+    """Return 1 with the derivative of the log area of the sampled emissive triangle.
 
-    Mitsuba samples a mesh with the triangle areas at load time and does not differentiate them.
+    The factor is needed because Mitsuba samples a mesh with the triangle areas at load time, without derivatives.
     """
     ray = dr.detach(origin.spawn_ray_to(light.p))
     ray.maxt = dr.largest(mi.Float)

@@ -3,8 +3,8 @@
 At a point of a B-spline curve with n segments, Mitsuba 3.9.1 computes derivatives from the global curve parameter v and
 takes floor(n v) as the segment index. Where v rounds to 1 this index is out of range, and Mitsuba reads past the end of
 its table: the result is garbage, or the process crashes. Boundary sampling is likely to hit this case, because the end
-of a curve is an edge to which bisection converges. Hits are therefore kept short of the end of their segment, by a
-bound on the rounding error.
+of a curve is an edge to which bisection converges. Hits near the end of a segment are therefore moved away from the
+end, by a bound on the rounding error.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from pathreplay.transport.signature import shape_met
 from pathreplay.transport.vertex import TraceConfig
 
 ROUNDING = 2.0**-22
-"""Rounding error of v = (s + k) / n in segments, per preceding segment; s is the local parameter of segment k."""
+"""Bound on the rounding error of n v = s + k, divided by k + 1. Here s is the local parameter of segment k."""
 
 
 def meet(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.PreliminaryIntersection3f:
-    """Intersect a ray with the scene. Detached."""
+    """Intersect a ray with the scene, with the workaround for curve ends. Detached."""
     hit = trace.scene.ray_intersect_preliminary(ray, coherent=coherent, reorder=False, active=active)
     return short_of_end(trace, ray, hit, active)
 

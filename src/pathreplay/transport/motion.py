@@ -20,10 +20,11 @@ COPIES = frozenset({"Instance", "ShapeGroup"})
 
 
 def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Shape, ...] | None:
-    """Find the shapes with gradients in any of their objects.
+    """Find the shapes that have gradients themselves or in a child object, such as a BSDF.
 
-    Returns None if other objects than shapes have gradients, if an instance moves, or for more than `FEW` shapes.
-    Objects in ``still`` are known not to move and do not count.
+    Returns None, which means that everything may move, if an object outside the shapes has gradients, if an instance or
+    shape group has gradients, or if more than `FEW` shapes have gradients. The caller knows that the objects in
+    ``still`` do not move; their gradients are ignored.
     """
     params = mi.traverse(scene)
     with dr.resume_grad():
@@ -37,7 +38,10 @@ def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Sha
 
 
 def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Return whether a parameter may move the surface that was hit; False for rays that hit nothing."""
+    """Return the lanes in which a parameter may move the surface that was hit.
+
+    If the moving shapes are not known individually (see `moving_shapes`), these are all lanes, including misses.
+    """
     moving = trace.traits.moving
     if moving is None:
         return mi.Bool(True)
@@ -57,11 +61,11 @@ def path_moves(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
 
 
 def edges_move(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
-    """Return whether an occluder, or a point that sees or lights the scene, depends on parameters with gradients.
+    """Return whether visibility edges may move: occluders, path vertices or emitters depend on gradients.
 
-    Like `path_moves`, without texture coordinates and the tangents that follow them: a texture occludes nothing. A
-    projector or spot light that rotates moves the boundary of the region that it lights, although the origin of its
-    light does not move.
+    The test is that of `path_moves`, with two differences. Texture coordinates and the tangents computed from them do
+    not count, because a texture occludes nothing. A projector or spot light that rotates counts, because the boundary
+    of its lit region moves although its origin does not.
     """
     lights = [*trace.traits.projectors, *trace.traits.spots]
     turns = trace.attach != "none" and any(with_gradients(light, "to_world", "cutoff_angle") for light in lights)
@@ -77,7 +81,7 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        # Rough lobes are attached only in scenes without outlines, which have no edges that could move.
+        # Rough lobes do not count for edges. With attach = 'delta', they are attached only in scenes without outlines.
         for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
             moving.append(sample.wo)
@@ -87,10 +91,10 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
 
 
 def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
-    """Return whether weights of continuations on surfaces depend on parameters with gradients, if nothing moves.
+    """Return whether the weight of a continuation on a surface depends on parameters with gradients.
 
-    ``at`` is the first arrival. The weight of an arbitrary lobe is probed in the way that later passes evaluate it.
-    Nothing is evaluated.
+    The paths must not move. ``at`` is the first arrival. The function traces the weight of an arbitrary lobe, as later
+    passes do, and inspects its gradients. Nothing is evaluated.
     """
     lobe, valid = at.hit.prim_index, at.hit.is_valid()  # values unknown at trace time
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, valid)

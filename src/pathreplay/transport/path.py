@@ -20,12 +20,12 @@ MAX_SURVIVAL = 0.95
 
 @dataclass
 class PathState:
-    """The state of a path as a loop variable: its arrival at the current vertex, and what it accumulated before."""
+    """Loop state of a path: its arrival at the current vertex, and the throughput accumulated before."""
 
     at: Arrival
     β: mi.Spectrum  # throughput
-    # Throughput in which the first zero weight of each channel is replaced, see `sustain`: keeps a path alive that
-    # still has derivatives. None if zero weights end the path.
+    # Throughput in which `sustain` replaces the first zero weight of each channel. It replaces β in the decision
+    # whether a path continues, so that paths with remaining derivatives go on. None if zero weights end paths.
     β_alive: mi.Spectrum | None
     η: mi.Float  # relative index of refraction since the camera
     depth: mi.UInt32  # number of vertices before this one
@@ -80,8 +80,8 @@ def survival(
 ) -> tuple[mi.Float, mi.Bool]:
     """Play Russian roulette: return 1 / (survival probability), and whether the path survives. Detached.
 
-    The probability is min(max β · η², 0.95) from depth ``rr_depth`` on and one before. η² removes the compression of
-    solid angle from the radiance throughput. Null boundaries between media do not terminate paths.
+    The probability is min(max β · η², 0.95) from depth ``rr_depth`` on, and 1 before. The factor η² cancels the change
+    of β by refraction, which scales radiance but not power. Paths are not terminated at null boundaries between media.
     """
     probability = dr.minimum(dr.max(β) * dr.square(η), MAX_SURVIVAL)
     plays = depth >= trace.rr_depth
@@ -93,10 +93,10 @@ def survival(
 def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spectrum:
     """Return the throughput that keeps a differentiated path alive: the first zero weight per channel is replaced.
 
-    A weight of zero still has a derivative, which multiplies the radiance beyond it. The path therefore continues as if
-    that weight were the largest among the channels (or one if all are zero). A second zero makes all derivatives zero
-    and ends the path. A null collision with zero probability in a channel ends the path there, too, because its weight
-    is determined by the sampling, not by the scene.
+    A weight of zero can have a nonzero derivative, which multiplies the radiance from the rest of the path. The path
+    therefore continues as if the weight were the largest among the channels, or one if all are zero. A second zero
+    makes all derivatives zero and ends the path. A channel in which null collisions have weight zero ends as well,
+    because this weight comes from the sampling and not from the scene.
     """
     w = dr.detach(step.w)
     w_max = dr.max(w)
@@ -109,7 +109,7 @@ def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spe
 def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.Bool) -> Arrival:
     """Trace the continuation of a step, taken from ``at``, to the next vertex.
 
-    With media a null boundary is transparent to multiple importance sampling: the density before it stays in effect.
+    With media, MIS ignores null boundaries: behind one, the density of the last scattering event remains in effect.
     """
     kept, null, ray = step.kept, step.null, step.ray_next
     hit = meet(trace, ray, active)

@@ -1,10 +1,10 @@
 """Scatter: sample the continuation of a path at a surface or in a medium, and differentiate its weight and direction.
 
-The sampling pass chooses a lobe; later passes keep that choice. A smooth lobe is differentiated as f/p with frozen
-sampling: either the next hit point is fixed on its surface and moves with it, or the direction is fixed (see
-`velocity`). A delta lobe is differentiated through its direction. With ``attach='all'`` the smooth lobes of attachable
-BSDFs are differentiated through their directions as well; in scenes without outlines this applies to narrow lobes for
-every ``attach`` but ``none``.
+The sampling pass chooses a lobe, and later passes keep this choice. Smooth lobes use detached sampling: the weight f/p
+is differentiated with constant p, and the direction either follows the next hit point, which is fixed on its surface,
+or is constant (see `velocity`). Delta lobes use attached sampling: the derivative passes through the sampled direction.
+With ``attach='all'``, the smooth lobes of attachable BSDFs are sampled attached as well. With ``attach='delta'``, this
+applies only to narrow lobes, and only in scenes without outlines.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from pathreplay.transport.vertex import (
     reciprocal,
 )
 
-# Tolerance for comparing a lobe sampled alone with the original sample: relative difference of the weights, squared
-# distance of the directions. Float32 rounding stays far below it; BSDFs that do not support restricted sampling
-# (`mask`) are far above it.
+# Tolerance for comparing a lobe sampled alone with the original sample. It limits the relative difference of the
+# weights and the squared distance of the directions. Rounding errors in float32 are far smaller; the differences for
+# BSDFs that do not support restricted sampling (`mask`) are far larger.
 SAME_LOBE = 1e-3
 
-# Density at the centre of a lobe above which it counts as narrow: that of a diffuse lobe. The noise of a detached lobe
-# is proportional to the slope of the log density, the noise of an attached lobe to the slope of the radiance.
-# docs/gradients.md lists the variances by roughness.
+# A lobe counts as narrow if its density at the centre is larger than that of a diffuse lobe. The noise of a detached
+# lobe is proportional to the slope of the log density, the noise of an attached lobe to the slope of the radiance.
+# docs/gradients.md lists the variances for different roughnesses.
 NARROW = 1 / dr.pi
 
 
 @dataclass
 class Sampled:
-    """The continuation sampled at a vertex, and the vertex's response to the direction of the emitter sample."""
+    """The continuation sampled at a vertex, and the scattering of light from the emitter sample's direction."""
 
     f: mi.Spectrum  # BSDF or phase function, times cosine on surfaces, for the direction of the emitter sample
     pdf_light: mi.Float  # density of sampling that direction
@@ -60,9 +60,9 @@ def choose(
     lit: mi.Bool,
     go_on: mi.Bool,
 ) -> Sampled:
-    """Sample the continuation, and evaluate the vertex for the direction ``d`` of the emitter sample. Detached.
+    """Sample the continuation, and evaluate scattering from the direction ``d`` of the emitter sample. Detached.
 
-    ``ctx`` holds the transport mode and may restrict sampling to one component.
+    ``ctx`` contains the transport mode and may restrict sampling to one component.
     """
     at_surface = go_on & v.surface
     if v.inside is not None and trace.media.passes:
@@ -79,7 +79,7 @@ def choose(
 def _in_medium(
     v: Vertex, at: Arrival, u: VertexSamples, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool, surface: Sampled
 ) -> Sampled:
-    """Extend the sample of a ``surface`` to lanes whose vertex is a medium event or a null boundary."""
+    """Replace the sample of a ``surface`` in lanes whose vertex is a collision in a medium or a null boundary."""
     event, through, phase, ctx = v.inside.event, v.inside.through, v.inside.phase, mi.PhaseFunctionContext(None)
     f, pdf_light = phase.eval_pdf(ctx, v.inside.mei, d, lit & event)
     wo, w, pdf = phase.sample(ctx, v.inside.mei, u.lobe, u.direction, go_on & event)
@@ -163,11 +163,11 @@ def _at_surface(
 
 
 def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Return the lanes with narrow lobes, where smooth continuations keep their direction instead of their hit point.
+    """Return the lanes with narrow lobes, in which smooth continuations have a fixed direction.
 
-    A narrow lobe turns the motion of the surface that it hits into noise. Applies only if boundary terms are estimated,
-    because a fixed direction slides over edges. The decision depends on the vertex and the incident ray only, so that
-    all directions sampled at the vertex move alike.
+    A direction that follows its hit point would turn the motion of the hit surface into noise, through the slope of a
+    narrow lobe. A fixed direction slides over edges, and is therefore used only if boundary terms are estimated. The
+    choice depends on vertex and incident ray only, so that all directions sampled at a vertex move in the same way.
     """
     if not (trace.may_slide and trace.traits.glossy):
         return mi.Bool(False)
@@ -176,10 +176,10 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
 
 
 def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Return the lanes whose hit lets part of the light pass unscattered. There, a continuation keeps its direction.
+    """Return the lanes whose hit surface passes part of the light unscattered; there, the direction is fixed.
 
-    A continuation that followed a moving transparent sheet would slide over the surfaces behind it and over their
-    edges. Applies only if boundary terms are estimated, which include the outline of the sheet.
+    A direction that followed a moving transparent sheet would slide over the surfaces behind the sheet and over their
+    edges. All lanes are False unless boundary terms are estimated, which include the outline of the sheet.
     """
     if not (trace.may_slide and trace.traits.veils):
         return mi.Bool(False)
@@ -208,12 +208,13 @@ def _delta_weight(
     w: mi.Spectrum,
     active: mi.Bool,
 ) -> mi.Spectrum:
-    """Return the weight of a sampled delta lobe, with the derivative of its own weight over its selection probability.
+    """Return the weight of a sampled delta lobe, differentiated at constant selection probability.
 
     A BSDF that chooses among lobes returns weights in which the selection probability has cancelled. In some plugins
-    (``thindielectric``, ``plastic``) the derivative of the Fresnel term cancels with it. The lobe is therefore sampled
-    again alone, through ``BSDFContext.component``, and divided by the selection probability. Where a plugin does not
-    support restricted sampling (weights or directions disagree), its own derivative is used.
+    (``thindielectric``, ``plastic``) the derivative of the Fresnel term is lost in this cancellation. The lobe is
+    therefore sampled again alone, through ``BSDFContext.component``, and its weight is divided by the detached
+    selection probability. If weight or direction then differ from the original sample, the plugin does not support
+    restricted sampling, and the derivative of the original weight is used.
     """
     drawn = dr.detach(w)
     missing = mi.Bool(active)
@@ -235,10 +236,10 @@ def _delta_weight(
 def _at_particle(
     trace: TraceConfig, v: Vertex, again: VertexRecord, attached: bool, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
-    """Let the direction from a medium event follow the next surface point, as on surfaces.
+    """Evaluate weight, direction and density of the continuation from a collision in a medium again.
 
-    This applies only if that surface scatters or emits and so may have texture seams and edges. Otherwise the direction
-    is fixed in space, which is less noisy.
+    The direction follows the next hit point only if the surface hit there scatters or emits, because such a surface may
+    have texture seams and edges. Otherwise the direction is constant, which is less noisy.
     """
     kept, hit_next = again.kept, again.hit_next
     d, J = kept.d, mi.Float(1)

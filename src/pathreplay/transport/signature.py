@@ -1,4 +1,4 @@
-"""Surface signatures, which differ for two rays with an edge between them, and edge normals."""
+"""Hashes of the surfaces that rays hit, which differ for two rays with an edge between them, and edge normals."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import TraceConfig
 
 TUBES = mi.ShapeType.Cylinder, mi.ShapeType.BSplineCurve, mi.ShapeType.LinearCurve
-"""Open at both ends: their outline consists of silhouettes and rims."""
-# Cosine between ray and normal of a tube below which an edge is its silhouette, above which it is its rim.
+"""Shapes that are open at both ends: their outlines consist of silhouettes and rims."""
+# The edge of a tube is its silhouette if the cosine between ray and normal is smaller than this, and its rim otherwise.
 GRAZING = 0.05
 
 
 def place_met(
     trace: TraceConfig, hit: mi.PreliminaryIntersection3f, active: mi.Bool, shape: mi.ShapePtr, facets: bool = True
 ) -> mi.UInt32:
-    """Compute a hash of the surface that a ray met: 0 for none, else a value per shape, instance and smoothing group.
+    """Compute a hash of the surface that a ray hit, from shape, instance and smoothing group; 0 on a miss.
 
     ``shape`` is the result of `shape_met`. Smoothing groups are distinguished only if ``facets``; each triangle of a
     flat-shaded mesh is its own group.
@@ -39,14 +39,14 @@ def _group(tables: Tables, shape: mi.UInt32, triangle: mi.UInt32, met: mi.Bool) 
 
 
 def shape_met(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.ShapePtr:
-    """Return the shape that a ray met; for an instance the instanced shape, which preliminary intersections lack."""
+    """Return the shape that a ray hit. On an instance this is the shape inside, which ``hit.shape`` does not name."""
     if not trace.traits.copies:
         return hit.shape
     return hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & hit.is_valid()).shape
 
 
 def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
-    """Hash of two integers (Knuth's multiplicative hashing)."""
+    """Hash two integers (Knuth's multiplicative hashing)."""
     h = (h ^ x) * mi.UInt32(0x9E3779B1)
     return h ^ (h >> 15)
 
@@ -54,7 +54,7 @@ def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
 def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
     """Return whether the shading normal of a mesh faces away from a ray along ``d``, so that shading is black.
 
-    Other shapes face away only at their silhouette, by rounding. A discontinuity there is an outline and nothing else.
+    On other shapes this happens only at the silhouette, through rounding, where the outline is an edge in any case.
     """
     return si.shape.is_mesh() & (dr.dot(si.sh_frame.n, d) > 0)
 
@@ -67,7 +67,7 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
     """
     with dr.suspend_grad():
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        kind = si.shape.shape_type()  # not of hit.shape, which has no type on an instance
+        kind = si.shape.shape_type()  # on an instance, hit.shape has no type
         on_mesh = active & si.shape.is_mesh()
         square, disk = kind == int(mi.ShapeType.Rectangle), kind == int(mi.ShapeType.Disk)
         limb = dr.abs(dr.dot(si.n, ray.d)) < GRAZING
@@ -97,9 +97,10 @@ def outline_gap(
     ray: mi.Ray3f,
     active: mi.Bool,
 ) -> mi.Float:
-    """Evaluate B = n·(o + t d - z): signed distance along n of a line from an outline point z, which ``ray`` hit at t.
+    """Evaluate B = n·(o + t d - z): the signed distance, along n, of a line from a point z of an outline.
 
-    z has fixed surface coordinates on its shape. Differentiable in o, d and the shape; zero where not ``active``.
+    ``ray`` hit z at distance t. z has fixed surface coordinates on its shape. Differentiable in o, d and the shape;
+    zero where not ``active``.
     """
     z = surface_point(hit, dr.detach(ray), active).p
     return dr.select(active, dr.dot(n, o + dr.select(active, hit.t, 0) * d - z), 0)
@@ -113,8 +114,9 @@ def _nearest_side(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
         flags = mi.RayFlags.FollowShape | mi.RayFlags.Minimal
         corners.append(corner.compute_surface_interaction(ray, flags, active).p)
     a, b, c = corners
-    sides = (c - b, c - a, b - a)  # facing a, b, c
+    sides = (c - b, c - a, b - a)  # opposite a, b, c
     weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
-    heights = [dr.abs(w) * dr.rcp(dr.norm(side)) for w, side in zip(weights, sides, strict=True)]  # over twice the area
+    # Distances of the point from the sides, divided by twice the area of the triangle.
+    heights = [dr.abs(w) * dr.rcp(dr.norm(side)) for w, side in zip(weights, sides, strict=True)]
     nearest = dr.select(heights[1] < heights[2], sides[1], sides[2])
     return dr.select(heights[0] < dr.minimum(heights[1], heights[2]), sides[0], nearest)

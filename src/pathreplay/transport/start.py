@@ -15,7 +15,7 @@ from pathreplay.transport.volume.passage import skip_null
 
 @dataclass
 class CameraStart:
-    """Paths that begin with camera rays. The rays are the differentiable function whose adjoint is q_0."""
+    """The start of paths at camera rays. The adjoint q_0 of a path is back-propagated through its camera ray."""
 
     ray: mi.Ray3f  # attached to the camera's parameters, if these have gradients
     sampler: Sampler  # source of the random numbers of the paths
@@ -43,7 +43,7 @@ class CameraStart:
 def behind_emitters(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """Return the hit, or the first hit behind area emitters if one was hit; distances are measured along ``ray``."""
+    """Return the first hit that is not on an area emitter; distances are measured along ``ray``."""
     passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
     si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed)
     onward = si.spawn_ray(ray.d)

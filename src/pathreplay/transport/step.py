@@ -34,7 +34,7 @@ class Visit:
     """The state of a path that arrives at a vertex."""
 
     at: Arrival
-    β: mi.Spectrum  # throughput; real collisions are sampled in proportion to it
+    β: mi.Spectrum  # throughput, on which the probability of a real collision depends
     go_on: mi.Bool  # False at the last vertex that ``max_depth`` allows
     active: mi.Bool
 
@@ -47,11 +47,11 @@ def choose_step(
     flight: Flight | None = None,
     ctx: mi.BSDFContext | None = None,
 ) -> SampledStep:
-    """Sample a step: emitter sample and continuation come from the random numbers ``u``.
+    """Sample a step. The random numbers ``u`` determine the emitter sample and the continuation.
 
-    With media, the flight (unless ``flight`` is given) and the shadow ray draw from ``sampler``; null boundaries are
-    returned as ``null`` steps, which do not count as vertices. ``ctx`` holds the transport mode (default: radiance) and
-    may restrict sampling on surfaces to one BSDF component.
+    With media, ``sampler`` provides the random numbers of the shadow ray and, unless ``flight`` is given, of the
+    flight. Null boundaries are returned as ``null`` steps, which do not count as vertices. ``ctx`` contains the
+    transport mode (default: radiance) and may restrict sampling on surfaces to one BSDF component.
     """
     ctx = mi.BSDFContext() if ctx is None else ctx
     at, go_on, active = visit.at, visit.go_on, visit.active
@@ -82,9 +82,10 @@ def repeat_step(
 ) -> Step:
     """Evaluate the same step again, differentiable in emission, BSDFs, textures and media.
 
-    If ``attached``, the step is also differentiable in the incident ray, its density and all geometry: the hit point
-    follows ray and shape, and the continuation follows as described in `scatter`. Otherwise vertices and directions are
-    constants. Visibility and Russian roulette are never differentiated. ``ctx`` is the context that `choose_step` used.
+    If ``attached``, the step is also differentiable in the incident ray, its density and all geometry. The hit point
+    then moves with ray and shape, and the continuation moves as described in `scatter`. Otherwise vertices and
+    directions are constant. Visibility and Russian roulette are never differentiated. ``ctx`` is the context that
+    `choose_step` used.
     """
     ctx = mi.BSDFContext() if ctx is None else ctx
     v = arrive.repeat(trace, again, attached, active)

@@ -10,21 +10,21 @@ import mitsuba as mi
 
 T = TypeVar("T", bound="dr.ArrayBase")
 
-# Relative deviation of the normal's derivatives from those of a sphere up to which a surface is treated as a sphere.
+# A surface is treated as a sphere if dn = κ dp is satisfied up to this squared relative error.
 UMBILIC = 1e-4
-# Cosine between ray and normal below which derivatives of hits on spheres and cylinders are dropped. The band from here
-# to twice this value counts double, in compensation.
+# Derivatives of hits on spheres and cylinders are set to zero if the cosine between ray and normal is below this value.
+# In compensation, they are doubled between this value and twice this value.
 GRAZES = 0.01
 
 
 def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
     """Compute the surface interaction of a hit, differentiable in the ray and the shape.
 
-    The distance to a sphere or cylinder is a root whose derivative is proportional to 1 / c, with c the cosine between
-    ray and normal. Its square has no finite mean over rays, and where rounding puts a ray onto the silhouette the
-    derivative reaches many millions. Derivatives are therefore zero for c < `GRAZES` and doubled for `GRAZES` <= c < 2
-    `GRAZES`. Uniformly distributed rays have cosines with density proportional to c, which cancels 1 / c: both bands
-    contribute equally to the mean. The remaining bias is of second order in `GRAZES`.
+    The derivative of the distance to a sphere or cylinder is proportional to 1 / c, with c the cosine between ray and
+    normal. The square of this derivative has no finite mean over rays, and where rounding puts a ray onto the
+    silhouette, the derivative reaches many millions. Derivatives are therefore set to zero for c < `GRAZES` and doubled
+    for `GRAZES` <= c < 2 `GRAZES`. Uniformly distributed rays have cosines with a density proportional to c, which
+    cancels 1 / c, so that both bands contribute equally to the mean. The remaining bias is of second order in `GRAZES`.
     """
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
     kind = si.shape.shape_type()
@@ -49,10 +49,10 @@ def _times(value: T, by: mi.Float) -> T:
 
 
 def steady(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-    """Replace the shading frame of mesh hits by one that depends only on the shading normal.
+    """Replace the shading frame of mesh hits by a frame that depends only on the shading normal.
 
-    Mitsuba's frame uses the tangent of the triangle and is discontinuous across mesh edges. With this frame, isotropic
-    lobes sampled with equal random numbers have equal directions on both sides of an edge.
+    Mitsuba's frame uses the tangent of the triangle and is discontinuous across mesh edges. With the new frame, an
+    isotropic lobe sampled with equal random numbers gives equal directions on both sides of an edge.
     """
     turned = mi.SurfaceInteraction3f(si)
     turned.sh_frame = mi.Frame3f(si.sh_frame.n)
@@ -66,15 +66,15 @@ class SurfacePoint:
 
     p: mi.Point3f
     A: mi.Vector3f  # area element times the normal; only relative changes of its length are meaningful
-    n: mi.Normal3f  # normal on the side to which the sign of κ refers; detached
+    n: mi.Normal3f  # normal that determines the sign of κ; detached
     κ: mi.Float  # curvature of a sphere (> 0: convex), 0 for a plane, infinite for other surfaces; detached
 
 
 def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> SurfacePoint:
     """Return the point that ``ray`` hit, with fixed surface coordinates.
 
-    On meshes A is computed from the triangle itself. Derivatives with respect to texture coordinates would vanish where
-    these are degenerate, and would follow the texture coordinates where these move.
+    On meshes, A is the cross product of two sides of the triangle. The derivatives of position with respect to texture
+    coordinates are not used: they vanish where texture coordinates are degenerate, and change where these move.
     """
     flags = mi.RayFlags.FollowShape
     on_mesh = active & hit.shape.is_mesh()

@@ -7,17 +7,17 @@ depend on its parametrisation: d may move with any velocity field V(d) if the we
     V_H    follows y, which is fixed on its surface: J_H = |A·d| / r², with A the area element at y
     0      keeps d
 
-V_H keeps the edges of emitters and the seams between materials at fixed positions of the integrand. Otherwise their
-motion is a boundary term that the interior term misses. But where x slides past the surface of y at a distance h,
-(log J_H)' grows like 1/h, so that the variance is infinite wherever two surfaces touch. The field used is therefore the
-blend V = φ V_H, with φ = 1 - exp(-m) and m = h r / h0²:
+With V_H, the edges of emitters and the seams between materials stay at fixed positions of the integrand. With other
+fields, their motion is a boundary term that the interior term misses. However, where x slides past the surface of y at
+a distance h, (log J_H)' grows like 1/h, so that the variance is infinite wherever two surfaces touch. The field used
+here is therefore the blend V = φ V_H, with φ = 1 - exp(-m) and m = h r / h0²:
 
     (log J)' = φ (log J_H)' + ∇φ·V_H,        ∇φ·V_H = -m exp(-m) (n·d_H') / (n·d)
 
-The second equation holds because h is the same for all d that meet the plane of y, while r is not. m also grows with r
-because the few directions at grazing angles to a near plane meet it far away: following those hit points costs little
-variance, and edges lie there. For a sphere h is the distance from x to the sphere, which is also constant over d and
-does not vanish at its silhouette. On other curved shapes V = V_H.
+The second equation uses that r depends on d and h does not: all d that hit the plane of y have the same h. The factor r
+in m keeps V close to V_H for hit points far away on a near plane. Few directions reach these points, at grazing angles.
+Following these points costs little variance, and edges lie there. For a sphere, h is the distance from x to the sphere,
+which also does not depend on d and does not vanish at the silhouette. On other curved shapes, V = V_H.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def blend_length(shape: mi.Shape) -> float:
 def moved_direction(
     lengths: mi.Float, origin: mi.Interaction3f, d: mi.Vector3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Float]:
-    """Attach V to the recorded direction ``d``: return ``d`` and J = 1 with the derivatives that V prescribes.
+    """Return the recorded direction ``d``, and J = 1, with the derivatives that the field V prescribes.
 
-    ``lengths`` holds the `blend_length` of each shape, and ``hit`` is the intersection of the continuation from
-    ``origin`` along ``d``. Rays that leave the scene keep their direction. Differentiable in ``origin`` and in the
+    ``lengths`` contains the `blend_length` of each shape, and ``hit`` is the intersection of the continuation from
+    ``origin`` along ``d``. Rays that leave the scene have a constant direction. Differentiable in ``origin`` and in the
     shape that was hit.
     """
     valid = active & hit.is_valid()
@@ -58,7 +58,7 @@ def moved_direction(
     ok = valid & (facing > 0)
     dist2 = dr.select(ok, dr.squared_norm(towards), 1)
     d_H = towards * dr.rsqrt(dist2)
-    # Distances in corners are tiny: the derivative of the logarithm stays finite where powers would overflow.
+    # The derivative of log J stays finite at the tiny distances in corners, where powers of distances would overflow.
     log_J_H = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
 
     h0 = dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, hit.shape), ok)
@@ -83,7 +83,7 @@ def jumps_at_facets(
 def held_direction(
     origin: mi.Interaction3f, d: mi.Vector3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.Vector3f:
-    """Attach ``d`` to the point that it hits from ``origin``: return ``d`` with the derivatives of that direction.
+    """Return ``d`` with the derivatives of the direction from ``origin`` to the hit point, which is fixed on its shape.
 
     Differentiable in ``origin`` and in the shape that was hit.
     """
@@ -101,8 +101,8 @@ def _share(h0: mi.Float, y: SurfacePoint, towards: mi.Vector3f, active: mi.Bool)
     n = dr.select(turned, -n, n)
     κ = dr.select(turned ^ (dr.dot(y.A, y.n) < 0), -y.κ, y.κ)
     blends = active & (h0 > 0) & dr.isfinite(κ)
-    # Distance to the sphere of curvature κ through y, ||x - centre| - 1/|κ||, in a form without cancellation; for κ =
-    # 0, distance to the plane.
+    # h = ||x - centre| - 1/|κ||, the distance to the sphere of curvature κ through y, in a form without cancellation.
+    # For κ = 0, h is the distance to the plane.
     h = (κ * r * r - 2 * dr.dot(n, towards)) / (1 + dr.norm(n - κ * towards))
     m = dr.maximum(h, 0) * r / dr.square(h0)
     steep = m * dr.exp(-m) * r / dr.dot(n, towards)

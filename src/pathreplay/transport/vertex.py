@@ -24,13 +24,13 @@ class TraceConfig:
     scene: mi.Scene
     traits: Traits
     media: Media = None  # type: ignore[assignment]
-    """None in a scene without media, where paths follow the conventions of Mitsuba's `path`. With media they follow
-    `volpath`: null boundaries do not count as vertices."""
+    """None in a scene without media. Paths follow the conventions of Mitsuba's `path` without media, and those of
+    `volpath` with media: null boundaries then do not count as vertices."""
 
     # Properties of the integrator.
     attach: str
-    """Selects the quantities that follow moving parameters: with ``none`` nothing, with ``delta`` hit points and the
-    directions of delta lobes, with ``all`` also the directions of the BSDFs in ``traits.attachables``."""
+    """Selects which parts of a path move with the parameters. ``none``: no part. ``delta``: hit points and the
+    directions of delta lobes. ``all``: also the sampled directions of the BSDFs in ``traits.attachables``."""
     hide_emitters: bool
     """Hides directly visible emitters."""
     max_depth: int
@@ -38,25 +38,27 @@ class TraceConfig:
     rr_depth: int
     """As in Mitsuba."""
     skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
-    """A method of Mitsuba's integrators."""
+    """The method of Mitsuba's integrators of this name."""
 
     # Inputs of gradient estimators.
     baseline: Callable[..., mi.Spectrum] | None = None
     """Maps (MediumInteraction3f, extinction, majorant, Bool) to a Spectrum, an estimate of the radiance that arrives at
-    a point of a medium from the rest of the ray (None: zero). Its quality affects noise only, not the mean."""
+    a point of a medium along the ray. None means zero. The quality of the estimate affects noise, but not the mean."""
     branching: mi.Float | None = None
-    """Relative weight of null collisions (Float, see `branch_weight`) if one null collision per path is kept, for
-    derivatives where collisions are never real; else None."""
+    """Relative weight c of null collisions (see `branch_weight`), or None if no null collision is kept. One null
+    collision per path is kept for derivatives where real collisions cannot occur."""
     may_slide: bool = False
-    """Boundary terms are estimated, for which smooth continuations move differently (see `scatter`)."""
+    """Whether boundary terms are estimated. Some smooth continuations then have a fixed direction, which may slide over
+    edges (see `keeps_direction` and `is_seen_through` in `scatter`)."""
 
     # Choices of the caller.
     skips_null: bool = False
-    """Rays skip null boundaries, and ``media`` is None: the configuration of the search for edges."""
+    """Whether rays skip null boundaries; ``media`` must be None. The search for edges uses this configuration."""
     steady_frames: bool = False
-    """Shading frames of meshes come from `steady`."""
+    """Whether `steady` replaces the shading frames of meshes."""
     background_apart: bool = False
-    """A ray that leaves the scene arrives at no vertex: the caller adds the `background` after all paths have ended."""
+    """Whether the caller adds the `background` after all paths have ended. Rays that leave the scene then have no
+    vertex at their end."""
 
     @property
     def resamples(self) -> bool:
@@ -65,7 +67,7 @@ class TraceConfig:
 
     @property
     def follows(self) -> bool:
-        """Whether smooth lobes may be attached: all attachable ones, or narrow ones where nothing has an outline."""
+        """Whether smooth lobes may be sampled attached: all of them, or narrow lobes in scenes without outlines."""
         narrow = self.attach == "delta" and not self.traits.outlines
         return bool(self.traits.attachables) and (narrow or self.attach == "all")
 
@@ -82,7 +84,7 @@ class TraceConfig:
 
 @dataclass
 class VertexSamples:
-    """The random numbers of one vertex: an input of the step, so that later passes repeat it exactly."""
+    """The random numbers of one vertex. They are an input of the step, so that later passes repeat the step exactly."""
 
     light: mi.Point2f  # choice of the emitter and of the point on it
     lobe: mi.Float  # choice of the BSDF's lobe
@@ -111,7 +113,7 @@ class Arrival:
 
 @dataclass
 class SampledContinuation:
-    """The choices of the sampling pass at a vertex. Later passes keep these values and attach derivatives to them."""
+    """The choices of the sampling pass at a vertex. Later passes use the same values and add derivatives."""
 
     d: mi.Vector3f  # sampled direction, world space
     pdf: mi.Float  # its solid-angle density, or the probability of the delta lobe
@@ -140,8 +142,8 @@ class Flight:
     event: mi.Bool  # a real collision happened before any surface
     t: mi.Float  # distance to that collision
     density: mi.Float  # its probability density p σ̄; 1 without a collision
-    W: mi.Spectrum  # weight of the null collisions before it; 1 in grey media
-    along: mi.Float  # random offset in [0, 1) of the points at which the derivative is taken
+    W: mi.Spectrum  # product of the weights of the null collisions before it; 1 in grey media
+    along: mi.Float  # random offset in [0, 1) of the points at which the transmittance is differentiated
     p: mi.Float = None  # type: ignore[assignment]  # probability that the collision was real (None if no null collisions are kept)
     # None without emissive media:
     E: mi.Spectrum = None  # type: ignore[assignment]  # emission accumulated along the flight
@@ -149,11 +151,11 @@ class Flight:
     c_emit: mi.Spectrum = None  # type: ignore[assignment]  # weight of the emission at that distance
     # Used by the sampling pass only; None when read from a record:
     σ_s: mi.Spectrum = None  # type: ignore[assignment]  # scattering coefficient at the collision
-    null: NullCollision = None  # type: ignore[assignment]  # a null collision of the flight, if one is kept
+    null: NullCollision = None  # type: ignore[assignment]  # the null collision that is kept; None if none is kept
 
     @staticmethod
     def none(media: Media) -> Flight:
-        """Create an empty flight, as the sampling pass represents it."""
+        """Create a flight of length zero without a collision, with the fields of the sampling pass."""
         zero, nothing = mi.Float(0), mi.Spectrum(0)
         flight = Flight(mi.Bool(False), zero, mi.Float(1), mi.Spectrum(1), mi.Float(0), σ_s=nothing)
         if media.emissive:
@@ -162,20 +164,23 @@ class Flight:
 
     @property
     def weight(self) -> mi.Spectrum:
-        """Weight of the radiance from the end: σ_s over density at a collision, times the weight of null collisions."""
+        """Weight of the radiance from the flight's end: ``W``, times σ_s / density at a collision."""
         return dr.select(self.event, self.σ_s * dr.rcp(self.density), 1) * self.W
 
 
 @dataclass
 class NullCollision:
-    """A null collision, kept with a probability proportional to ``mass``: see `branch_weight`."""
+    """The null collision of a flight that weighted reservoir sampling selected, for `null_branching`.
 
-    t: mi.Float
-    ω: mi.Spectrum  # weight of this collision and of those before it, over the probability of keeping it
-    bare: mi.Float  # the same without the collisions before it
-    mass: mi.Float  # sum over all null collisions of the flight
+    Each null collision has a resampling weight m and is selected with probability m / ``mass``.
+    """
+
+    t: mi.Float  # distance of the collision along the ray
+    ω: mi.Spectrum  # W of the null collisions before it, times c branch_weight(p, c) / σ̄, over m
+    bare: mi.Float  # the same without the factor W
+    mass: mi.Float  # sum of m over all null collisions of the flight
     number: mi.Float  # number of null collisions of the flight
-    pick: mi.Float  # a random number for choosing among flights
+    pick: mi.Float  # random number for the choice between this flight and earlier flights of the path
 
 
 @dataclass
@@ -183,34 +188,34 @@ class Shadow:
     """The transmittance between a vertex and its emitter sample, as sampled."""
 
     T: mi.Spectrum  # estimate of the transmittance, 0 if occluded
-    y: mi.Float  # distance of the point at which its derivative is taken
+    y: mi.Float  # distance of the point at which the transmittance is differentiated
     medium: mi.MediumPtr  # the medium at y; null if the ray crosses none
     length: mi.Float  # length of the ray inside media
 
 
 @dataclass
 class KnownLight:
-    """The contribution of emitters to a surface, recorded where no later pass differentiates it."""
+    """Emission and emitter sample at a surface, recorded as values if later passes do not differentiate emitters."""
 
-    glow: mi.Spectrum  # emission at the vertex, a part of e
+    glow: mi.Spectrum  # radiance emitted at the vertex, MIS weighted
     d: mi.Vector3f  # direction of the emitter sample
-    w: mi.Spectrum  # its radiance over density, MIS weighted
+    w: mi.Spectrum  # radiance of the emitter sample over density, MIS weighted
 
 
 @dataclass
 class Lighting:
-    """The e of a surface as a linear function of emitted radiance: see `relight`."""
+    """Inputs of `relight`, which evaluates the contribution e of a surface as a linear function of emitted radiance."""
 
     si: mi.SurfaceInteraction3f
     seen: mi.Bool  # emission at the vertex counts
     light: mi.DirectionSample3f  # the emitter sample
-    w: mi.Spectrum  # weight of its radiance: f / density, MIS weighted
-    lit: mi.Bool
+    w: mi.Spectrum  # weight of the sample's radiance: f / density, MIS weighted
+    lit: mi.Bool  # the emitter sample is valid and unoccluded
 
 
 @dataclass
 class VertexRecord:
-    """The data on a vertex and its continuation that later passes use."""
+    """The record of a vertex and its continuation, from which later passes evaluate the step again."""
 
     at: Arrival
     u: VertexSamples
@@ -223,9 +228,9 @@ class VertexRecord:
 
 @dataclass
 class Signature:
-    """The discrete choices at a vertex. A discontinuity separates paths with different signatures."""
+    """The discrete choices at a vertex. Paths with different signatures are separated by a discontinuity."""
 
-    met: mi.Bool  # the ray met a surface or had a real collision in a medium
+    met: mi.Bool  # the ray hit a surface or had a real collision in a medium
     shape: mi.UInt32  # registry index of the shape, 0 in a medium or on a miss
     lobe: mi.UInt32  # the lobe of the continuation
 
@@ -254,12 +259,12 @@ class SampledStep(Step):
 
     @property
     def seen(self) -> mi.Bool:
-        """Mitsuba's alpha: the ray met something and does not pass through it unscattered."""
+        """Mitsuba's alpha: the ray hit a surface or had a collision, and is not passed on unscattered."""
         return self.signature.met & ~self.null
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """Evaluate Veach's power heuristic, p_a² / (p_a² + p_b²); zero where that is not finite."""
+    """Evaluate Veach's power heuristic, p_a² / (p_a² + p_b²); return zero where the quotient is not finite."""
     a2 = dr.square(pdf_a)
     weight = a2 / dr.fma(pdf_b, pdf_b, a2)
     return dr.select(dr.isfinite(weight), weight, 0)

@@ -1,9 +1,9 @@
 """Traverse the objects and parameters of a scene without reference cycles that would keep the objects alive.
 
-A class defined inside a function is a reference cycle: the class, and all objects in the closures of its methods, live
-until the cyclic garbage collector runs. If such a closure holds scene objects, an area light can outlive its shape, to
-which it has a raw pointer, and Dr.Jit still traces it in every virtual function call. The traversal class is therefore
-created once per variant, with an empty closure.
+A class defined inside a function is part of a reference cycle. The class, and all objects in the closures of its
+methods, live until the cyclic garbage collector runs. If such a closure contains scene objects, an area light can
+outlive its shape. The light has a raw pointer to the shape, and Dr.Jit still traces the light in every virtual function
+call. The traversal class is therefore created once per variant, with an empty closure.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _COLLECTORS: dict[type, type] = {}
 
 
 def _collector() -> Any:
-    """Create a traversal callback of the active variant, which collects the child objects and values of a node."""
+    """Create a traversal callback for the active variant that collects the child objects and values of a node."""
     base = mi.TraversalCallback
     if base not in _COLLECTORS:
 

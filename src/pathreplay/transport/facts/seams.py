@@ -13,16 +13,17 @@ import mitsuba as mi
 import numpy as np
 
 CHECKERBOARD, BITMAP, ATTRIBUTE = "Checkerboard", "BitmapTextureImpl", "MeshAttribute"
-"""Class names; that of a bitmap ends with its texel type."""
+"""Class names. The name of a bitmap class begins with this and ends with the texel type."""
 PROBES, BESIDE = 64, 1e-3
-"""Number of texels of a bitmap that are probed, and the distance of the probes from texel borders, in texels."""
+"""Number of texel borders that are probed, and the distance of the probes from the borders, in texels."""
 WAVELENGTHS = 440.0, 510.0, 580.0, 650.0
 JUMPS = 0.5
-"""A difference across a texel border counts as a jump above this fraction of the difference of the two texels."""
+"""A bitmap is discontinuous at a texel border if its values on both sides differ by more than this fraction of the
+difference between the two texels."""
 
 
 def has_seams(textures: Iterable[mi.Texture]) -> bool:
-    """Return whether a texture is discontinuous. Bitmaps do not expose their filter and are therefore evaluated."""
+    """Return whether one of the textures is discontinuous. Bitmaps, which do not expose their filter, are evaluated."""
     return any(map(_jumps, textures))
 
 
@@ -34,7 +35,7 @@ def _jumps(texture: mi.Texture) -> bool:
 
 
 def _is_nearest(texture: mi.Texture) -> bool:
-    """Return whether a bitmap differs as much across texel borders as between texel centres."""
+    """Return whether a bitmap uses nearest-neighbour lookup: whether its values jump at texel borders (see `JUMPS`)."""
     params = mi.traverse(texture)
     height, width, channels = params["data"].shape
     raw = texture.eval_3 if channels == 3 else texture.eval_1

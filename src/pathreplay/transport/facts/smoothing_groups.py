@@ -1,7 +1,7 @@
 """Smoothing groups of meshes: sets of triangles that are shaded as one surface. Edges lie where two groups meet.
 
 Triangles share the shading normal of a common vertex. At a visible edge, and at a seam of texture coordinates,
-modelling programs duplicate vertices: the triangles on both sides then share two positions but no vertex.
+modelling programs duplicate vertices. The triangles on both sides then have two positions in common, but no vertex.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 WELD, ULPS = 1e-5, 4
-"""Largest distance of coincident vertices: a fraction of the mesh's diagonal, and a number of units in the last place.
-"""
+"""Vertices coincide if their distance is at most WELD times the mesh's diagonal plus ULPS units in the last place."""
 
 
 def mesh_smoothing_groups(mesh: mi.Mesh) -> np.ndarray:
@@ -23,16 +22,16 @@ def mesh_smoothing_groups(mesh: mi.Mesh) -> np.ndarray:
     if "faces" not in params:
         return np.zeros(mesh.face_count(), int)
     faces, positions = (np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions"))
-    # Emission is continuous across seams: segments that detect one would be wasted, and fewer would find the outline.
+    # Emission is continuous across seams. Segments that detect a seam would be wasted, and fewer would detect outlines.
     return smoothing_groups(faces, positions, 0 if mesh.is_emitter() else WELD)
 
 
 def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WELD) -> np.ndarray:
-    """Return the index of each triangle's group: different on the two sides of an edge, zero in a mesh without edges.
+    """Return the group index of each triangle; all indices are zero in a mesh without edges.
 
-    Triangles connected by vertices form a group. Where a group meets itself without sharing vertices, as at the end of
-    an edge, each triangle is a group of its own. Vertices coincide if their distance is at most ``weld`` times the
-    mesh's diagonal plus rounding, or, for ``weld`` = 0, if they are equal.
+    Triangles connected by common vertices form a group. Two triangles of one group can also be adjacent across an edge,
+    for example if the edge ends inside the group. Such triangles become separate groups. Vertices coincide if their
+    distance is at most ``weld`` times the mesh's diagonal plus rounding. For ``weld`` = 0 they must be equal.
     """
     count = len(positions)
     links = coo_matrix((np.ones(faces.size, bool), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), (count, count))
@@ -50,9 +49,9 @@ def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WEL
 
 
 def _places(positions: np.ndarray, vertices: np.ndarray, weld: float) -> np.ndarray:
-    """Return the index of the position of each vertex, equal for vertices that coincide up to rounding.
+    """Return the index of the position of each vertex, which is equal for vertices that coincide up to rounding.
 
-    Modelling programs compute both ends of a seam separately, say by sines of 0 and of 2π, which differ in the last
+    Modelling programs compute both ends of a seam separately, for example as sin 0 and sin 2π. These differ in the last
     bits.
     """
     ends, at = np.unique(vertices, return_inverse=True)

@@ -18,8 +18,8 @@ from pathreplay.transport.facts.seams import CHECKERBOARD
 from pathreplay.transport.facts.smoothing_groups import mesh_smoothing_groups
 from pathreplay.transport.velocity import blend_length
 
-# Class names, because Mitsuba's objects do not expose these properties. The sampling of ATTACHABLE BSDFs is a smooth
-# function of the random numbers, and their choice of lobe depends on no parameter.
+# Class names identify BSDFs, because Mitsuba's objects do not expose these properties. ATTACHABLE BSDFs sample a
+# direction that is a smooth function of the random numbers, and choose a lobe independently of all parameters.
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 RELIEFS = frozenset({"NormalMap", "BumpMap"})
@@ -28,12 +28,12 @@ FRAMES = RELIEFS | {TWO_SIDED}
 DULL = FRAMES | {MASK, "SmoothDiffuse"}
 INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
-"""Table entries of shapes whose only edges are outlines, and of flat-shaded meshes."""
+"""Entries of `Tables.groups_at` for shapes whose only edges are outlines, and for flat-shaded meshes."""
 COARSE = 1.0
 """Mean angle in degrees between triangles and shading normals above which a mesh is coarse."""
 
 MOST_RUNS = 4096
-"""Largest number of runs of equal values that a frozen recording writes one by one."""
+"""Largest number of runs of equal values that `_array` writes, one by one, while `dr.freeze` records."""
 
 T = TypeVar("T")
 V = TypeVar("V")
@@ -44,13 +44,14 @@ A = TypeVar("A", bound="dr.ArrayBase")
 class Tables:
     """Facts about BSDFs and shapes by registry index, as arrays for lookup in kernels.
 
-    A frozen function receives them as input or from the integrator; otherwise the recording writes them, see `_array`.
+    A frozen function receives the tables as input or from the integrator. Otherwise they are created while `dr.freeze`
+    records (see `_array`).
     """
 
     attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: no BSDF)
     blend_lengths: mi.Float  # `velocity.blend_length` by shape
     groups_at: mi.UInt32  # by shape: offset of its triangles in `groups`, or `WHOLE` or `FACETS`
-    groups: mi.UInt32  # concatenated `smoothing_groups` of these meshes; entry 0 is unused
+    groups: mi.UInt32  # concatenated `smoothing_groups` of the meshes with such an offset; entry 0 is unused
     emitter_bounds: mi.Float  # bounding spheres of mesh emitters: see `emitter_bounds`
 
 
@@ -77,7 +78,7 @@ class Traits:
     veils: bool  # some surface may scatter part of the light and pass the rest unscattered
     masks_mirrors: bool  # some mask covers delta lobes
     narrow: bool  # some surface may have a narrow smooth lobe
-    glossy: bool  # narrow, and no checkerboard has seams over which such a lobe would slide
+    glossy: bool  # narrow, and the scene has no checkerboard, over whose seams such a lobe would slide
     outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
     tables: Tables = None  # type: ignore[assignment]  # for the current pass, like all fields below
     # Whether these have gradients:
@@ -91,8 +92,8 @@ class Traits:
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     """Inspect all BSDFs and shapes of a scene, including nested BSDFs and instanced shapes.
 
-    Tables and facts about gradients are left out: see `SceneFacts`. In scenes with media, null boundaries do not count
-    as mirrors: the step passes light through them.
+    `SceneFacts` adds the tables and the facts about gradients. In scenes with media, null boundaries do not count as
+    mirrors, because the step passes light through them.
     """
     media = any(isinstance(node, mi.Medium) for node in nodes)
     bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and is_null(node))]
@@ -141,8 +142,8 @@ def tables_of(
 def _array(kind: type[A], values: ArrayLike) -> A:
     """Create an array of these values.
 
-    `dr.freeze` does not know host arrays that are created while it records. There the recording writes the array
-    instead, in runs of equal values.
+    While `dr.freeze` records, arrays must not be created from host memory. The array is then written by recorded
+    scatters, one per run of equal values.
     """
     if not dr.flag(dr.JitFlag.FreezingScope):
         return kind(values)
@@ -185,9 +186,9 @@ def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def is_coarse(mesh: mi.Mesh) -> bool:
-    """Return whether triangles of a mesh deviate from their shading normals by `COARSE` degrees or more on average.
+    """Return whether triangles deviate from their shading normals by more than `COARSE` degrees on average.
 
-    Near their silhouette such triangles hide emitters that the smooth shading would see.
+    Near the silhouette, such triangles occlude emitters that lie above the horizon of the shading normal.
     """
     params = mi.traverse(mesh)
     if mesh.has_face_normals() or not mesh.has_vertex_normals() or "faces" not in params:
@@ -242,7 +243,7 @@ def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
 
 
 def _attachables(nodes: set[mi.Object], shapes: list[mi.Shape]) -> list[mi.BSDF]:
-    # Mitsuba gives an emissive shape without BSDF a diffuse one; a BSDF that the user did not ask for is not attached.
+    # Mitsuba adds a diffuse BSDF to an emissive shape without BSDF. Such a BSDF is not sampled attached.
     of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
     seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
     bsdfs = {node for node in nodes if isinstance(node, mi.BSDF)} - (of_lamps - seen)
@@ -260,7 +261,7 @@ def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
-    """Return whether no surface point sees an edge: the scene has a single shape, which sees no edge of itself.
+    """Return whether no surface point sees an edge: the scene has a single shape, and no edge of it is visible from it.
 
     A flat shape does not see itself at all. A sphere sees itself from the inside, where a texture would have a seam.
     """

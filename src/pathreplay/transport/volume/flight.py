@@ -1,13 +1,13 @@
 """Free flight through a medium: delta tracking to the next real collision, and its derivative in later passes.
 
-Tentative collisions are sampled from a majorant; each is real with some probability. The first real collision ends the
-flight, as does the surface that bounds the medium. The sampling is not differentiated. The derivative is that of the
-integrand, transmittance times scattering coefficient, at the sampled distance:
+Tentative collisions are sampled from a majorant, and each is either real or null. The flight ends at the first real
+collision, or at the surface that bounds the medium. The sampling is not differentiated. Later passes differentiate the
+integrand, which is transmittance times scattering coefficient, at the sampled distance:
 
     d log T = -∫ dσ_t ds,  estimated at evenly spaced points y of the flight:  -(t - a) · mean of dσ_t(y).
 
-This estimator divides by nothing that may be zero. It is therefore also correct where null collisions are never sampled
-(a constant grid).
+This estimator contains no division by a value that may be zero. It is therefore also correct where null collisions are
+never sampled, for example in a constant grid.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.vertex import Arrival, Flight, NullCollision, TraceConfig, reciprocal
 from pathreplay.transport.volume.media import Media, carried, interaction, is_grid, majorant, span
 
-# Number of points of a flight at which the derivative of its transmittance is taken. Fewer add variance, more take
-# time; four give the lowest variance at equal time for the cloud of `pathreplay bench media`.
+# Number of points of a flight at which its transmittance is differentiated. Fewer points increase the variance, more
+# points take more time. Four give the lowest variance at equal time for the cloud of `pathreplay bench media`.
 POINTS = 4
 
 
 def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
     """Return 1 / (p + c (1 - p)) for probability p of a real collision and relative weight c of null collisions.
 
-    The derivative of a collision, dσ_s L_s, is needed also where σ_s is zero and collisions are never real. Real
-    collisions estimate the fraction p / (p + c (1 - p)) of it and null collisions the rest, c (1 - p) / (p + c (1 -
-    p)). L_s is estimated at each real collision, but at only one null collision per path. With c the inverse of the
-    number of null collisions, all estimates have equal weight.
+    The derivative of in-scattering, dσ_s L_s, is also needed where σ_s is zero and real collisions cannot occur. Real
+    collisions therefore estimate only the fraction p / (p + c (1 - p)) of this derivative, and null collisions estimate
+    the rest. The in-scattered radiance L_s is estimated at each real collision, but at only one null collision per
+    path. All estimates have equal weight if c is the inverse of the number of null collisions.
     """
     return dr.rcp(p + c * (1 - p))
 
@@ -41,8 +41,9 @@ def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
 def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, active: mi.Bool) -> Flight:
     """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
 
-    ``β`` is the throughput. In chromatic media a collision is real with probability p = Σ_k β_k σ_k / (σ̄ Σ_k β_k),
-    which takes the history of all channels into account.
+    ``β`` is the throughput, and W the product of the weights of previous null collisions on the flight. In chromatic
+    media, a collision is real with probability p = Σ_k |β_k W_k| σ_k / (σ̄ Σ_k |β_k W_k|), which takes the history of
+    all channels into account.
     """
     media = trace.media
     ray, medium = dr.detach(at.ray), at.medium
@@ -123,7 +124,7 @@ def _tentative(
     σ: mi.Float,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
-    """Return the distance from ``t`` to the next tentative collision, and the majorant there: σ, except in grids."""
+    """Return the distance from ``t`` to the next tentative collision, and the majorant there (``σ`` outside grids)."""
     step = dr.select(σ > 0, -dr.log(1 - u) * dr.rcp(σ), dr.inf)
     for grid in trace.media.grids:
         mine = active & is_grid(grid, medium)
@@ -148,7 +149,7 @@ class Flown:
     """A recorded flight, evaluated again differentiably."""
 
     mei: mi.MediumInteraction3f  # the interaction at the collision
-    w: mi.Spectrum  # weight of radiance from the end: relative transmittance (1), times σ_s/density at a collision
+    w: mi.Spectrum  # weight of radiance from the flight's end: W, times σ_s/density at a collision; differentiable
     e: mi.Spectrum  # emission along the flight, and a control variate with value zero and a derivative of mean zero
 
 
@@ -157,14 +158,15 @@ def fly_again(
 ) -> Flown:
     """Evaluate a recorded flight again, differentiable in the coefficients and, if ``attached``, in ray and ``reach``.
 
-    ``reach`` is the distance to the surface (infinity if there is none). A collision keeps its position relative to the
-    two ends of the medium on its ray. It thus moves with the ray and with the surface, and no derivative is lost at the
-    end of the flight. With b any function of position and direction (`TraceConfig.baseline`),
+    ``reach`` is the distance to the surface, or infinity if there is none. The position of a collision relative to the
+    two ends of the medium on its ray is constant. The collision thus moves with the ray and with the surface, and no
+    derivative is lost at the end of the flight. Let b be any function of position and direction
+    (`TraceConfig.baseline`). The control variate
 
-        (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the last term at a collision x only)
+        (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the second term only at a collision x)
 
-    is the score of the sampling density times b, whose mean is zero. It removes the variance that arises because the
-    radiance is large while its derivative with respect to the medium is small.
+    is the score of the sampling density times b, and has mean zero. Without this term, the variance is high where the
+    radiance is large and its derivative with respect to the medium is small.
     """
     medium, ray = at.medium, at.ray
     in_medium = active & (medium != None)  # noqa: E711
@@ -182,7 +184,7 @@ def fly_again(
 
     σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
     σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
-    if trace.branch:  # null collisions estimate the rest of the derivative at fixed position
+    if trace.branch:  # null collisions estimate the rest of the derivative, for a fixed position
         assert trace.branching is not None
         rest = 1 - flight.p * branch_weight(flight.p, trace.branching)
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
@@ -224,6 +226,6 @@ def fly_again(
 def _guess(
     trace: TraceConfig, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool
 ) -> mi.Spectrum:
-    """Evaluate the baseline; zero where it would cause bias (collisions are never real, and no null ones are kept)."""
+    """Evaluate the baseline, or zero where it would cause bias: for σ_t = 0, if no null collision is kept."""
     b = trace.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
     return b if trace.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

@@ -35,7 +35,7 @@ class Media:
     homogeneous: bool  # some of these other media have constant coefficients
     chromatic: bool  # some extinction differs between channels
     emissive: bool  # some medium emits
-    passes: bool  # some surface may randomly pass light unscattered
+    passes: bool  # some surface that is not a null boundary may pass light unscattered
     branches: bool  # see `wants_branch`
     around: mi.Medium | None  # the medium that contains the sensor
 
@@ -82,14 +82,14 @@ def _is_grid(medium: mi.Medium) -> TypeGuard[Grid]:
 
 
 def wants_branch(media: Sequence[mi.Medium]) -> bool:
-    """Return whether an extinction gradient needs null collisions, as where collisions are never real."""
+    """Return whether null branching is needed: some extinction has gradients and may be zero somewhere."""
     return any(map(_misses, media))
 
 
 def _misses(medium: mi.Medium) -> bool:
-    """Return whether extinction has gradients, and is not known to be constant and nonzero.
+    """Return whether extinction has gradients, and is not known to be nonzero everywhere.
 
-    Its values are unknown while `dr.freeze` records.
+    Only constant extinction is inspected, and no values are known while `dr.freeze` records.
     """
     moving = with_gradients(medium, "sigma_t", "scale")
     known = medium.is_homogeneous() and not dr.flag(dr.JitFlag.FreezingScope)
@@ -122,10 +122,11 @@ def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) 
 
 
 def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """Return a distance with fixed position relative to the moving ends of [a, b], and the interval's stretch factor.
+    """Attach a distance to the moving ends of the interval [a, b]; return it with the interval's stretch factor.
 
-    The values are those without motion, ``t`` and 1. The derivatives are those of a + x (b - a) and (b - a) / (b₀ -
-    a₀), with x the relative position. Where ``where`` is false or b is infinite, nothing moves.
+    The returned values are ``t`` and 1. Their derivatives are those of a + x (b - a) and (b - a) / (b₀ - a₀), where x
+    is the constant relative position of ``t`` in the interval, and a₀ and b₀ are the detached ends. Where ``where`` is
+    false or b is infinite, both derivatives are zero.
     """
     a0, b0 = dr.detach(a), dr.detach(b)
     held = where & dr.isfinite(b0) & (a0 < b0)

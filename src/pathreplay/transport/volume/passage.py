@@ -1,6 +1,6 @@
 """Rays through null boundaries: the first hit behind them, and the transmittance of the media in between.
 
-The search for edges ignores null boundaries: light passes straight through them, so they occlude nothing.
+The search for edges ignores null boundaries, because light passes straight through them and they occlude nothing.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pathreplay.transport.vertex import TraceConfig
 from pathreplay.transport.volume.shadow import Stretch, shadow, transmittance
 
 SHORT_OF = 1 - 1e-3
-"""Fraction of the distance to an edge over which both sides share the transmittance: slightly below 1, so that the rays
-of both sides still intersect the surfaces behind."""
+"""The transmittance up to this fraction of the distance to an edge is estimated once for the rays on both sides. The
+value is slightly below 1, so that the remaining parts of both rays still intersect the surfaces at the edge."""
 STEP = 1e-5
 """Offset behind a null boundary at which the next ray starts, relative to distance and coordinates."""
 
@@ -25,7 +25,7 @@ STEP = 1e-5
 def skip_null(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """Return the hit, or the first hit behind null boundaries; distances are measured along ``ray``."""
+    """Return the first hit that is not on a null boundary; distances are measured along ``ray``."""
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
     passing = active & _is_boundary(here)
     while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond null boundaries"):
@@ -47,7 +47,10 @@ def _is_boundary(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 def transmittance_up_to(
     trace: TraceConfig, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: Sampler, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
-    """Estimate the transmittance up to ``reach``, from inside ``medium``; also return the last medium. Detached."""
+    """Estimate the transmittance of a ray that starts in ``medium``, up to distance ``reach``. Detached.
+
+    Returns the transmittance and the medium at the end.
+    """
     ray = mi.Ray3f(ray)
     ray.maxt = reach
     stretch = Stretch.begin(ray, medium, active)
@@ -64,8 +67,9 @@ def transmittance_past_edge(
 ) -> mi.Spectrum:
     """Estimate the transmittance of a shadow ray that passes an edge at distance ``t``. Detached.
 
-    It is computed in two parts, so that the ray passes the edge on its own side: `spawn_ray` at null boundaries shifts
-    rays sideways by more than their distance from the edge.
+    The ray is split shortly before the edge, and the second part starts exactly on the ray. Otherwise the ray might
+    pass the edge on the wrong side: `spawn_ray` at null boundaries shifts rays sideways by more than their distance
+    from the edge.
     """
     t = SHORT_OF * t
     T, medium = transmittance_up_to(trace, ray, t, medium, sampler, active)

@@ -1,8 +1,8 @@
 """Shadow rays through media and null boundaries: ratio tracking, and the derivative of the estimated transmittance.
 
-T = exp(-∫ σ_t ds) is estimated from boundary to boundary; in homogeneous media it is known in closed form. Its
-derivative is taken at one point y, uniformly distributed over the total length Λ of medium on the ray:  d log T = -Λ
-dσ_t(y).
+T = exp(-∫ σ_t ds) is estimated separately for each segment between boundaries. In homogeneous media, T is known in
+closed form. The derivative is estimated at one point y, uniformly distributed over the total length Λ of media on the
+ray, as d log T = -Λ dσ_t(y).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Stretch:
         return hit, a, b, inside & (a < b)
 
     def beyond(self, hit: mi.PreliminaryIntersection3f, T: mi.Spectrum) -> tuple[Stretch, mi.Spectrum]:
-        """Return the segment behind that surface, and ``T`` times the null transmission of the surface."""
+        """Return the segment behind the surface at ``hit``, and ``T`` times the null transmission of the surface."""
         met, ray = self.active & hit.is_valid(), mi.Ray3f(self.ray)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, met)
         T = dr.select(met, T * si.bsdf(ray).eval_null_transmission(si, met), T)
@@ -124,7 +124,7 @@ def ratio_tracking(
 def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool, active: mi.Bool) -> mi.Spectrum:
     """Return the recorded transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
 
-    The point y keeps its position relative to the two surfaces (or ray ends) next to it.
+    The position of the point y relative to the two surfaces (or ray ends) next to y is constant.
     """
     walked = active & (kept.medium != None)  # noqa: E711
     y, growth = kept.y, mi.Float(1)
@@ -146,13 +146,14 @@ def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool
 def _boundary(trace: TraceConfig, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool) -> mi.Float:
     """Return the distance along ``ray`` of the surface next to y, towards the end (sign 1) or the origin (sign -1).
 
-    If there is none, the distance is that of the ray's end, or 0. Differentiable in the ray and in the surface.
+    Without such a surface, return the distance of the ray's end (sign 1) or 0 (sign -1). Differentiable in the ray and
+    in the surface.
     """
     probe = mi.Ray3f(still.o + y * still.d, sign * still.d, still.time, still.wavelengths)
     probe.maxt = still.maxt - y if sign > 0 else y
     hit = meet(trace, probe, active)
     met = active & hit.is_valid()
-    # Intersect the attached ray from y on: the interaction with a sphere is that of the first hit along the ray.
+    # The attached ray also starts at y, because Mitsuba computes the interaction with a sphere at the ray's first hit.
     probe.o, probe.d = ray.o + y * ray.d, sign * ray.d
     si = hit.compute_surface_interaction(probe, mi.RayFlags.All, met)
     return dr.select(met, dr.replace_grad(y + sign * hit.t, y + sign * si.t), ray.maxt if sign > 0 else 0)
