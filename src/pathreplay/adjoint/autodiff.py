@@ -15,7 +15,7 @@ from pathreplay.transport.vertex import Arrival, Step, TraceConfig, VertexRecord
 
 
 class Unreached(PathreplayError):
-    """No parameter with gradients reaches the light paths. Callers that know sensor and scene add the remedy."""
+    """Raised if the light paths depend on no parameter with gradients. Callers that know the scene add the remedy."""
 
 
 @dataclass
@@ -28,17 +28,17 @@ class RayDerivative:
 
     @staticmethod
     def zero() -> RayDerivative:
-        # Not dr.zeros, which caches the field types of a class from the first variant in which it is used.
+        # dr.zeros is not used here: it caches the field types of a class from the first variant that calls it.
         return RayDerivative(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
 
     def finite_part(self) -> tuple[RayDerivative, mi.Bool]:
-        """Replace non-finite derivatives by zero; also return the mask of finite ones."""
+        """Replace non-finite derivatives by zero; also return the mask of lanes with finite derivatives."""
         ok = dr.all(dr.isfinite(self.o)) & dr.all(dr.isfinite(self.d)) & dr.isfinite(self.pdf)
         return dr.select(ok, self, RayDerivative.zero()), ok
 
 
 class NonFiniteCounter:
-    """Counts the paths that lost a part of their gradient because it was not finite."""
+    """Counts the paths that lost a part of their gradient, because it was not finite or a record was full."""
 
     def __init__(self) -> None:
         self.count = dr.zeros(mi.UInt32, 1)
@@ -46,8 +46,8 @@ class NonFiniteCounter:
     def add(self, lost: mi.Bool) -> None:
         """Count lanes from inside a loop.
 
-        The count is a side effect of the loop, as gradients are. A mask that leaves the loop would be evaluated
-        separately, which would run the whole kernel again.
+        The count is a side effect of the loop, like gradients. A mask returned from the loop would be evaluated
+        separately, and the whole kernel would run again.
         """
         dr.scatter_add(self.count, mi.UInt32(1), mi.UInt32(0), lost)
 
@@ -71,8 +71,8 @@ def backward_step(
 ) -> tuple[mi.Spectrum, RayDerivative, mi.Bool]:
     """Back-propagate  δL β_i·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; return L_i and q_i.
 
-    ``L`` is L_{i+1}. If not ``attached``, q stays zero at no cost. A non-finite q_i is set to zero; the last result is
-    the mask of these lanes. With ``rays_only`` no parameter receives a gradient.
+    ``L`` is L_{i+1}. If not ``attached``, q is zero and is not computed. A non-finite q_i is set to zero, and the last
+    result is the mask of these lanes. With ``rays_only``, no parameter receives a gradient.
     """
     lost = mi.Bool(False)
     with dr.resume_grad():
@@ -139,7 +139,7 @@ def derivative_by_place(s: mi.Point2f, f: Callable[[mi.Point2f], mi.Float]) -> m
     with dr.resume_grad():
         dr.enable_grad(s)
     with dr.resume_grad(s):
-        # f(s) has no gradient if it is constant, as for the samples of a light without extent.
+        # f(s) has no gradient if it is constant, for example for the samples of a point light.
         dr.backward_from(f(s), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         return mi.Vector2f(dr.grad(s))
 
@@ -157,7 +157,7 @@ def tangents(*values: Any) -> list[Any]:
     attached = [value for value in values if dr.grad_enabled(value)]
     if not attached:
         return [dr.zeros(type(value)) for value in values]
-    # Interior gradients must survive: some of the values are computed from others.
+    # Gradients of interior nodes must not be cleared, because some of the values are computed from others.
     dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
     return [dr.grad(value) for value in values]
 
@@ -165,7 +165,7 @@ def tangents(*values: Any) -> list[Any]:
 def backward(target: mi.Float) -> None:
     """Back-propagate from a scalar per path.
 
-    Raises Unreached if no parameter with gradients reaches the scalar, where the gradient would silently be zero.
+    Raises Unreached if the scalar depends on no parameter with gradients; the gradient would silently be zero.
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):

@@ -1,10 +1,10 @@
 """The learned baseline of volume gradients: an estimate of the radiance that arrives at a point of a medium.
 
-It consists of two averages over cells of position and direction: X of the radiance scattered at real collisions, and Y
-of the radiance transmitted where rays continue. With p the probability of a real collision, b = (1 - p) X + p Y. Only
-earlier passes contribute, so that b is independent of the current pass and its score has mean zero for any b. This
-requires that real collisions and, if they are kept, null collisions evaluate b everywhere. A poor estimate increases
-noise and causes no bias. Nothing here is differentiated.
+The estimate uses two averages over cells of position and direction: X, of the radiance scattered at real collisions,
+and Y, of the radiance transmitted where rays continue. With p the probability of a real collision, the baseline is b =
+(1 - p) X + p Y. Only earlier passes contribute to b. It is therefore independent of the current pass, and the control
+variate of `fly_again` has mean zero for any b. This requires that real collisions and, if they are kept, null
+collisions evaluate b everywhere. A poor estimate increases noise and causes no bias. Nothing here is differentiated.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from pathreplay.errors import PathreplayError
 from pathreplay.transport.vertex import VertexRecord
 from pathreplay.transport.volume.media import interaction, majorant, span
 
-# Cells along each axis of space, and along each side of the octahedron of directions. 8³ x 4² cells of two averages
-# with four values each take 256 KiB. Three such arrays exist: averages, their sums, and the sums of the present pass.
-# With more cells each has fewer samples, and gradients get noisier again: see the cloud of `pathreplay bench media`.
+# Cells along each axis of space, and along each side of the octahedral map of directions. 8³ x 4² cells of two averages
+# with four values each take 256 KiB. Three such arrays exist: averages, their sums, and the sums of the current pass.
+# With more cells, each cell has fewer samples and gradients are noisier: see the cloud of `pathreplay bench media`.
 CELLS, SIDES = 8, 4
 AVERAGES = 2 * CELLS**3 * SIDES**2  # X and Y side by side
-# Factor of the previous sums when a pass is added: about the last ten passes contribute.
+# Factor by which the previous sums are multiplied when a pass is added. About the last ten passes contribute.
 MEMORY = 0.9
-# Initial weight of a null collision (see `branch_weight`), as for fifty null collisions per path.
+# Initial weight c of null collisions (see `branch_weight`), which corresponds to fifty null collisions per path.
 FIRST_BRANCHING = 0.02
+# Number of partial sums over which the numbers of null collisions are distributed.
 SLOTS = 256
-# Weight of the mean of all cells in the average of a cell, in samples of that cell.
+# The mean over all cells contributes to the average of a cell like this number of samples of the cell.
 PRIOR = 2.0
 
 
 def _channels() -> int:
-    """Return the number of channels: 3 in rgb variants; 1, their mean, in others, where wavelengths vary by path."""
+    """Return the number of channels: 3 in rgb variants, and otherwise 1, the mean over the wavelengths of a path."""
     return 3 if mi.is_rgb else 1
 
 
@@ -66,7 +67,7 @@ class BaselineCells:
 
 @dataclass
 class BaselineStats:
-    """Radiance that gradient passes have seen in media, as sums: those of several passes or shards can be added."""
+    """Sums of the radiance that gradient passes computed in media. Sums of several passes or shards can be added."""
 
     cells: BaselineCells
     sums: mi.Float  # for each average, Σ weight·L in three channels and Σ weight
@@ -86,7 +87,7 @@ class BaselineStats:
         return BaselineStats(self.cells, sums, nulls, paths, self.passes | other.passes)
 
     def learn(self, replayed: VertexRecord, L: mi.Spectrum) -> None:
-        """Add the radiance ``L`` that arrived along the ray of a replayed vertex; called in the loop of a pass."""
+        """Add the radiance ``L`` along the ray that arrives at a replayed vertex; called in the loop of a pass."""
         at, flight = replayed.at, replayed.kept.media.flight
         in_medium = at.medium != None  # noqa: E711 (an array of pointers)
         event = in_medium & flight.event
@@ -97,7 +98,7 @@ class BaselineStats:
         x = interaction(at.medium, at.ray, flight.t)
         y = interaction(at.medium, at.ray, a + flight.along * length)
         self._add(self.cells.index(x.p, at.ray.d), L, mi.Float(1), event)
-        # y is sampled with density 1 / length. The weight, the length in mean free paths, compensates for it.
+        # y is sampled with density 1 / length. The weight, the length in mean free paths, compensates for this density.
         weight = length * majorant(at.medium, at.ray, length > 0)
         self._add(self.cells.index(y.p, at.ray.d) + 1, L, weight, length > 0)
 
@@ -117,7 +118,7 @@ class BaselineStats:
 class Baseline:
     """The part of a baseline that a pass reads, suitable as an input of a frozen function.
 
-    ``branching`` is the relative weight of a null collision, see `branch_weight`.
+    ``branching`` is the relative weight c of null collisions (see `branch_weight`).
     """
 
     cells: BaselineCells
@@ -154,7 +155,7 @@ class BaselineState:
         return BaselineState(BaselineCells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
 
     def after(self, seen: BaselineStats) -> BaselineState:
-        """Return the state after passes with these statistics; call it once their kernels have been launched."""
+        """Return the state updated with the statistics of passes; call this after their kernels were launched."""
         branching = seen.paths / (seen.paths + dr.sum(seen.nulls)) if seen.paths else self.branching
         sums, passes = MEMORY * self.sums + seen.sums, self.passes | seen.passes
         return BaselineState(self.cells, sums, branching, passes)
@@ -180,7 +181,7 @@ class BaselineState:
 
 
 def _averages(sums: mi.Float) -> mi.Float:
-    """Compute the averages from the sums; the mean of all cells supports cells with few samples."""
+    """Compute the averages from the sums; the mean over all cells dominates in cells with few samples."""
     i = dr.arange(mi.UInt32, AVERAGES)
     is_y = i % 2 == 1
     weight = dr.gather(mi.Float, sums, 4 * i + 3)

@@ -15,16 +15,18 @@ class Driver(Protocol):
     """Back-propagates the adjoint radiance ``δL`` of each path into the parameters and into the ``start``.
 
     Returns whether the paths move with the parameters. ``lost`` counts paths that lost a part of their gradient. The
-    caller suspends gradients (`dr.suspend_grad`). The docstring of a driver says what it does not differentiate.
+    caller suspends gradients (`dr.suspend_grad`). The docstring of each driver lists what the driver does not
+    differentiate.
     """
 
     def __call__(self, trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool: ...
 
 
 class ForwardDriver(Protocol):
-    """Returns the tangent of the radiance, whether the path met anything (both per path), and whether the paths move.
+    """Computes the tangent of the radiance from the tangents of the parameters.
 
-    The parameters carry tangents.
+    Returns the tangent and Mitsuba's alpha, both per path, and whether the paths move with the parameters. For ``lost``
+    see `Driver`.
     """
 
     def __call__(

@@ -1,7 +1,7 @@
 """The emission-only driver: if only emitted radiance has gradients, a single pass without a record suffices.
 
-L = Σ β_i e_i is linear in emitted radiance, and β does not depend on it. δL β_i de_i is therefore back-propagated
-during sampling.
+L = Σ β_i e_i is linear in emitted radiance, and the throughput β does not depend on emitted radiance. δL β_i de_i is
+therefore back-propagated while the path is sampled.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from pathreplay.transport.vertex import TraceConfig
 def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """Return whether only emitted radiance has gradients: no weight depends on a parameter, and nothing moves.
 
-    False in scenes with media. The test traces the code, and so it is also False if Dr.Jit evaluates virtual calls
-    immediately: the first vertices may then not reach all objects.
+    Returns False in scenes with media. The test traces a step symbolically, which reaches all objects. It returns False
+    if Dr.Jit evaluates virtual calls immediately, because the first vertices may then not reach all objects.
     """
     if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False
@@ -36,7 +36,7 @@ def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
 
 
 def lights_or(other: Driver) -> Driver:
-    """Return a driver that is `emission_only` where only emission varies, and ``other`` elsewhere."""
+    """Return a driver that calls `emission_only` if only emitted radiance has gradients, and ``other`` otherwise."""
 
     def driver(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
         return (emission_only if only_emission_varies(trace, start) else other)(trace, start, δL, lost)
@@ -46,11 +46,12 @@ def lights_or(other: Driver) -> Driver:
 
 @dr.syntax
 def emission_only(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
-    """Back-propagate the adjoint radiance ``δL`` into emitted radiance, for `only_emission_varies`; of any depth.
+    """Back-propagate the adjoint radiance ``δL`` into emitted radiance, for paths of any depth.
 
-    Each vertex contributes the emission of the hit surface and the emitter sample, with the weights of the image. A
-    path that leaves the scene also contributes the background. Returns False: paths do not move.
-    Not differentiated: everything but emitted radiance. Raises PathreplayError if no parameter reaches the paths.
+    The condition is `only_emission_varies`. Each vertex contributes the emission of the hit surface and the emitter
+    sample, with the same weights as in the image. A path that leaves the scene also contributes the background. Returns
+    False, because paths do not move. Not differentiated: everything except emitted radiance. Raises PathreplayError if
+    the paths depend on no parameter with gradients.
     """
     trace = replace(trace, background_apart=True)
     sampler, path = start.sampler, PathState.begin(trace, start)

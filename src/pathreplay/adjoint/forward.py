@@ -17,10 +17,10 @@ from pathreplay.transport.vertex import TraceConfig
 def forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """Compute the tangent of the radiance along the rays of a ``start``.
 
-    Returns ``(δL, valid, moves)``, the first two per ray. The parameters must carry tangents before the call. A weight
-    that is exactly zero keeps its derivative, because no division occurs: δβ_{i+1} = δβ_i w_i + β_i δw_i. If the path
-    ``moves`` with the parameters, ``lost`` counts the paths whose tangent was not finite and was dropped. Not
-    differentiated: visibility and, with ``attach='none'``, all motion.
+    The parameters must have tangents before the call. Returns ``(δL, valid, moves)``: tangent and alpha per ray, and
+    whether the path moves with the parameters. If it does, ``lost`` counts the paths whose tangent was not finite and
+    was dropped. The recurrence δβ_{i+1} = δβ_i w_i + β_i δw_i contains no division, and is therefore correct where a
+    weight is exactly zero. Not differentiated: visibility and, with ``attach='none'``, all motion.
     """
     with dr.resume_grad():
         δo, δd = tangents(*start.repeat())

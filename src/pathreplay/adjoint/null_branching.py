@@ -1,8 +1,9 @@
-"""Null branching: an extra path from a null collision, for derivatives where collisions are never real.
+"""Null branching: an extra path from a null collision, for derivatives where real collisions cannot occur.
 
-The derivative of a collision is dσ_s L_s - dσ_t b, with L_s the radiance that it would scatter. Where σ_s is zero no
-path ever scatters, so that L_s has no estimate. One null collision per path is therefore kept, and an extra path from
-there estimates L_s; `branch_weight` distributes the derivative between real and null collisions.
+The derivative at a collision is dσ_s L_s - dσ_t b, with L_s the in-scattered radiance and b the baseline. Where σ_s is
+zero, no path scatters, and nothing estimates L_s. One null collision per path is therefore kept, by weighted reservoir
+sampling, and an extra path from its position (the branch) estimates L_s. `branch_weight` distributes the derivative
+between real and null collisions.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ from pathreplay.transport.volume.media import interaction, majorant
 
 @dataclass
 class Branch:
-    """The null collision that is kept so far (loop state); zero before the first one."""
+    """The null collision that the reservoir contains (loop state). All fields are zero before the first collision."""
 
     p: mi.Point3f  # position of the collision
     d: mi.Vector3f  # direction of the path before the collision
     medium: mi.MediumPtr
-    weight: mi.Spectrum  # throughput times the weight of the collision, over its mass
-    bare: mi.Spectrum  # the same without the null collisions before it on its flight
-    mass: mi.Float  # sum over all null collisions so far
+    weight: mi.Spectrum  # throughput times `NullCollision.ω`
+    bare: mi.Spectrum  # throughput times `NullCollision.bare`
+    mass: mi.Float  # sum of the resampling weights of all null collisions so far
     number: mi.Float  # number of null collisions so far
-    depth: mi.UInt32  # number of vertices before
+    depth: mi.UInt32  # number of vertices before the collision
     η: mi.Float  # relative index of refraction since the camera
 
     @staticmethod
@@ -41,7 +42,7 @@ class Branch:
         return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, mi.Float(0), mi.Float(0), mi.UInt32(0), mi.Float(1))
 
     def offer(self, path: PathState, step: SampledStep) -> Branch:
-        """Choose between this null collision and that of another flight, in proportion to their masses."""
+        """Add the null collision of a flight to the reservoir: it replaces this collision with probability ~ mass."""
         ray, null = path.at.ray, step.kept.media.flight.null
         active = path.active & dr.any(path.β != 0)
         mass = self.mass + dr.select(active, null.mass, 0)
@@ -54,7 +55,7 @@ class Branch:
 
 
 def branch_backward(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ray3f, δL: mi.Spectrum) -> None:
-    """Back-propagate ``δL`` through the branch's contribution to the radiance, if a parameter reaches it."""
+    """Back-propagate ``δL`` through the `branch_term`, if this term depends on a parameter with gradients."""
     with dr.resume_grad():
         term = branch_term(trace, branch, sampler, ray)
         if dr.grad_enabled(term):
@@ -64,7 +65,7 @@ def branch_backward(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: m
 def branch_term(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ray3f) -> mi.Spectrum:
     """Return a term whose derivative is the branch's contribution to the derivative of the radiance (Spectrum).
 
-    The value of the term has no meaning. The extra path is detached; time and wavelengths are those of the camera
+    The value of the term has no meaning. The extra path is detached, and takes time and wavelengths from the camera
     ``ray``. Differentiable in the coefficients of the medium. The caller resumes gradients (`dr.resume_grad`).
     """
     onward = replace(trace, branching=None)

@@ -1,17 +1,17 @@
 """The pixel sweep: an image and the gradient of a quadratic loss from the same set of paths, each sampled once.
 
-The adjoint of a path is known only after its pixel is complete. Each lane therefore samples all N paths of a pixel,
-records them one after the other as `sweep` does for one path, and then sweeps back through all of them. Let I be the
-mean of the radiances L_s. For a loss with derivative f'(I), the adjoint of a path must not depend on its own radiance:
-the covariance of L_s and its derivative would bias the gradient. It must not depend on correlated paths either, for
-example on other stratified samples of the pixel. Paths are therefore drawn in mutually independent sets S, and the
-adjoint of each path uses the other sets only:
+The adjoint radiance of a path is known only after all paths of its pixel. Each lane therefore samples all N paths of a
+pixel, records each path like `sweep`, and then sweeps back through all records. Let I be the mean of the radiances L_s
+of the paths, and f'(I) the derivative of the loss. The adjoint of a path must not depend on the radiance of the same
+path, because the covariance of L_s and dL_s would bias the gradient. For the same reason, it must not depend on
+correlated paths, such as other stratified samples of the pixel. Paths are therefore drawn in mutually independent
+sets S, and the adjoint of each path uses only the other sets:
 
     δL_s = f'(I_{-S}) / N,    I_{-S} = (N I - Σ_S L) / (N - |S|),    f'(I) = offset + slope · I.
 
-The expected gradient equals that of an independent image. The variances differ. One difference is the covariance of
-f'(I) dL_s with the change of f' due to L_s: it lowers the variance where the loss demands more light, and raises it
-where the loss demands less. The other, of second order in 1/N, is the product of the noise of the image and the noise
+The expected gradient is the same as with an independent image, but the variance is not. First, f'(I) dL_s is correlated
+with the change of f' due to L_s. This lowers the variance where the loss demands more light, and raises it where the
+loss demands less. Second, a term of second order in 1/N is added: the product of the noise of the image and the noise
 of the derivative.
 """
 
@@ -36,7 +36,7 @@ from pathreplay.transport.vertex import TraceConfig
 
 @dataclass(frozen=True)
 class PixelLoss:
-    """Derivative of a loss with respect to the pixel of each lane: offset + slope · I."""
+    """The derivative of the loss with respect to the pixel of each lane: offset + slope · I, with I the pixel value."""
 
     offset: mi.Spectrum
     slope: mi.Spectrum
@@ -54,8 +54,8 @@ def pixel_sweep(
     """Trace ``paths`` paths (two or more) in every lane and back-propagate the loss.
 
     Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` maps (sampler,
-    active) to detached rays and their weights (Ray3f, Spectrum). The scene must have no media. `sweep` describes what
-    is not differentiated, what ``lost`` counts, and which errors are raised.
+    active) to detached rays and their weights (Ray3f, Spectrum). The scene must have no media. For ``lost``, quantities
+    that are not differentiated, and errors, see `sweep`.
     """
     room, size = room_for(trace), numbers.together(paths)
     total = mi.Spectrum(0)  # radiance of all paths

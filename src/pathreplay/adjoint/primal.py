@@ -17,8 +17,8 @@ from pathreplay.transport.vertex import TraceConfig
 def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool]:
     """Estimate the radiance along the rays of a ``start``; return ``(L, valid)`` per ray.
 
-    ``valid`` is Mitsuba's alpha: the path had a collision in a medium, or met a surface that did not pass it
-    unscattered. Nothing is differentiated.
+    ``valid`` is Mitsuba's alpha: the path had a collision in a medium, or was scattered or absorbed at a surface.
+    Nothing is differentiated.
     """
     path = PathState.begin(trace, start)
     L, valid = walk_on(trace, start.sampler, path)
@@ -27,9 +27,10 @@ def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool
 
 @dr.syntax
 def walk_on(trace: TraceConfig, sampler: Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
-    """Continue a path from its present state; return the radiance that arrives along it, and whether it met anything.
+    """Continue a path from its present state; return the radiance along the path, and ``valid`` (see `primal`).
 
-    The throughput of the path must be one: the radiance is relative to it.
+    The throughput ``path.β`` should be one, because it is a factor of the result. The background does not make a path
+    valid.
     """
     trace = replace(trace, background_apart=trace.media is None)
     L = mi.Spectrum(0)  # radiance so far

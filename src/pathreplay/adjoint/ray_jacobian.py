@@ -1,10 +1,10 @@
-"""Rays in four local coordinates, and the 4x4 Jacobian by which a step maps one ray to the next.
+"""Rays in four local coordinates, and the 4x4 Jacobian of the map from one ray of a path to the next.
 
-A ray has four degrees of freedom: its origin in the plane perpendicular to it, and its direction. Moving the origin
-along the ray changes neither the hit point nor the rest of the path, so the Jacobian in the six coordinates (o, d) is
-always singular. Two quantities of an arrival are not functions of the ray: its density and the distance from the
-previous vertex. They affect only the next vertex, through the MIS weight of its emission, and are differentiated there
-(`emission_slope`). They therefore need no place in the matrix.
+A ray has four degrees of freedom: the position of its origin in the plane perpendicular to the ray, and its direction.
+Moving the origin along the ray changes neither the hit point nor the rest of the path. The Jacobian in the six
+coordinates (o, d) would therefore always be singular. Two quantities of an arrival are not functions of the ray: the
+density, and the distance from the previous vertex. Both affect only the MIS weight of the emission at the next vertex,
+and are differentiated there (`emission_slope`), separately from the matrix.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from pathreplay.transport.step import repeat_step
 from pathreplay.transport.vertex import Arrival, TraceConfig, VertexRecord, VertexSamples, reciprocal
 
 # Noise is added where `independence` is below this value. For smooth lobes that follow their hit point, independence is
-# zero up to float32 rounding (1e-7). For mirrors, glass and attached rough metal it is above 1e-3. float64 tolerates
-# 1e-4.
+# zero up to float32 rounding (1e-7). For mirrors, glass and attached rough metal, independence is above 1e-3. In
+# float64, matrices with an independence of 1e-4 can be inverted accurately.
 ILL_CONDITIONED = 1e-4
 
 
@@ -33,15 +33,15 @@ class Recovery:
     """How ray adjoints are recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i, in float64.
 
     ``noise`` is the standard deviation of ε_i, which is +noise or -noise with equal probability. Of all distributions
-    with mean zero and this variance, this one stays furthest from zero, and thus keeps the matrix furthest from being
+    with mean zero and this variance, this distribution has the largest distance from zero, where the matrix is
     singular. 0 turns the noise off. Where A_i is ill-conditioned, X_i is the identity on directions and zero on
-    origins; elsewhere it is zero.
+    origins. Elsewhere, X_i is zero.
     """
 
     noise: float = 0.01
 
     def real(self, kind: type) -> type:
-        """Return the float64 counterpart of an array type of the variant, in which adjoints are recovered."""
+        """Return the float64 counterpart of an array type, in which adjoints are recovered."""
         return dr.float64_array_t(kind)  # type: ignore[no-any-return]
 
     def regularised(self, A: mi.Matrix4f, sign: mi.Float, smooth: mi.Bool) -> mi.Matrix4f:
@@ -76,21 +76,21 @@ class RayFrame:
 
 @dataclass
 class Slope:
-    """Derivative of δL·β e of a vertex with respect to the two quantities that are not functions of its ray."""
+    """Derivatives of δL·β e of a vertex with respect to properties of its arrival that its ray does not determine."""
 
     pdf: mi.Float  # density of the ray
-    slide: mi.Float  # distance by which the origin slides forward along the ray
+    slide: mi.Float  # distance by which the origin moves forward along the ray
 
 
 @dataclass
 class Linearised:
     """A step linearised in the four coordinates of its ray."""
 
-    A: mi.Matrix4f  # derivative of the next ray's coordinates by those of this ray
+    A: mi.Matrix4f  # ∂r_{i+1}/∂r_i: derivative of the next ray's coordinates
     e: mi.Vector4f  # derivative of δL·β_i e_i + (slope of e_{i+1})·(pdf, slide)
-    log_w: list[mi.Spectrum]  # derivative of log w_i by each of the four coordinates; 0 where w_i is 0
-    slope: Slope  # of the next vertex
-    frame_next: RayFrame  # of the next ray
+    log_w: list[mi.Spectrum]  # derivative of log w_i with respect to each coordinate; 0 where w_i is 0
+    slope: Slope  # slope of e_{i+1}, at the next vertex
+    frame_next: RayFrame  # axes of the next ray
 
 
 @dataclass
@@ -116,7 +116,10 @@ def length_scale(scene: mi.Scene) -> float:
 
 
 def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
-    """Differentiate weight·e (detached weight) by the density of an arrival and by the distance from its origin."""
+    """Differentiate weight·e with respect to the density of an arrival and to the motion of its origin along the ray.
+
+    ``weight`` is detached.
+    """
     if not has_smooth_lobes(trace):
         return Slope(mi.Float(0), mi.Float(0))
     slopes = []
@@ -143,10 +146,10 @@ def local_terms(
     frame_next: RayFrame,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Spectrum, list[mi.Float]]:
-    """Evaluate the step at ``v`` with a differentiable arrival; return the terms that make up its adjoint.
+    """Evaluate the step at ``v`` with a differentiable arrival; return the terms of which its adjoint consists.
 
-    These are δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), w_i/detach(w_i) (0 where w_i is 0), and the four coordinates
-    of the next ray. ``weight`` is δL β_i, and ``slope`` belongs to the next vertex.
+    The terms are δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), w_i/detach(w_i) (0 where w_i is 0), and the four
+    coordinates of the next ray. ``weight`` is δL β_i, and ``slope`` belongs to the next vertex.
     """
     step = repeat_step(trace, replace(v, at=at), True, active)
     o, d = step.ray_next.o, step.ray_next.d
@@ -159,10 +162,10 @@ def local_terms(
 def linearise(
     trace: TraceConfig, v: VertexRecord, onward: PathState, δL: mi.Spectrum, scale: float, active: mi.Bool
 ) -> Linearised:
-    """Differentiate `local_terms` by the four coordinates of the ray, and by nothing else.
+    """Differentiate `local_terms` with respect to the four coordinates of the ray, and to nothing else.
 
-    ``onward`` is the path at the next vertex, ``scale`` the unit of length. Both passes call this function, so that
-    their values agree to the last bit.
+    ``onward`` is the path at the next vertex, and ``scale`` the unit of length. Both passes call this function, and
+    their values therefore agree to the last bit.
     """
     slope = emission_slope(trace, onward.at, δL * onward.β, v.go_on)
     frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
@@ -183,10 +186,10 @@ def linearise(
 
 
 def _unit_tangent(value: mi.Float | float) -> mi.Float:
-    """Create an independent AD variable with tangent 1, also where gradients are suspended.
+    """Create an independent AD variable with tangent 1, even if gradients are suspended.
 
-    Gradients must be resumed for this variable only: virtual calls would otherwise propagate tangents of parameters
-    across the loop boundary.
+    The caller must resume gradients for this variable only. Otherwise virtual calls would propagate tangents of
+    parameters across the loop boundary.
     """
     variable = mi.Float(dr.detach(value))
     with dr.resume_grad():
@@ -196,7 +199,7 @@ def _unit_tangent(value: mi.Float | float) -> mi.Float:
 
 
 def random_sign(u: VertexSamples) -> mi.Float:
-    """Return +1 or -1 with equal probability, as a hash of the vertex's samples: both passes get the same sign."""
+    """Return +1 or -1 with equal probability, from a hash of the vertex's samples, and thus equal in both passes."""
     bits = [dr.reinterpret_array(mi.UInt32, x) for x in (u.light.x, u.roulette)]
     return dr.select((mi.sample_tea_32(bits[0], bits[1], 4)[0] & 1) == 0, mi.Float(1), mi.Float(-1))
 
@@ -205,8 +208,8 @@ def independence(A: mi.Matrix4f) -> mi.Float64:
     """Measure how far the columns of a 4x4 matrix are from linear dependence: about 1 / condition number.
 
     Modified Gram-Schmidt removes from each column the components along earlier columns. The result is the smallest
-    remaining norm, relative to the Frobenius norm. Cofactors, and so `dr.rcp`, cannot measure this: for a matrix of
-    rank two they consist of rounding errors.
+    remaining norm, relative to the Frobenius norm. The cofactors that `dr.rcp` computes cannot be used instead, because
+    they consist of rounding errors for a matrix of rank two.
     """
     real = dr.float64_array_t(mi.Float)
     columns = [[real(A[i, k]) for i in range(4)] for k in range(4)]

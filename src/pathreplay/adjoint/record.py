@@ -28,20 +28,20 @@ from pathreplay.transport.vertex import (
     VertexSamples,
 )
 
-# Largest depth that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
-# thread's stack is 8 MB. A stack overflow would end the process without a message.
+# Largest depth for which a path is recorded in thread-local memory. 16 lanes x 2048 vertices x up to 136 bytes are
+# 4.5 MB, and a thread's stack has 8 MB. A stack overflow would terminate the process without a message.
 MAX_DEPTH = 2048
 LARGEST_RECORD = 136
 """Bytes per vertex without media, in rgb variants."""
-# With media a vertex takes up to 210 bytes, and null boundaries have their own records.
+# With media, a vertex takes up to 210 bytes, and null boundaries are recorded like vertices.
 MAX_DEPTH_MEDIA = 1024
 MAX_RECORDS_MEDIA = 2000
 
 
 def deepest(trace: TraceConfig, device: Device | None = None) -> int:
-    """Return the largest ``max_depth`` that the sweep driver can hold for a scene, on the active variant's device.
+    """Return the largest ``max_depth`` for which the sweep driver can record paths, on the active variant's device.
 
-    On a GPU the records may use a fraction of its memory: see `pathreplay.platform.device`.
+    On a GPU, the records may use a fraction of its memory (see `pathreplay.platform.device`).
     """
     device = device_of(mi.variant()) if device is None else device
     if not device.is_gpu:
@@ -52,7 +52,10 @@ def deepest(trace: TraceConfig, device: Device | None = None) -> int:
 
 
 def largest_record(trace: TraceConfig) -> int:
-    """Return the larger size of a record in bytes: static paths record light, moving paths record random numbers."""
+    """Return the size in bytes of a record, for static or moving paths, whichever is larger.
+
+    Static paths record radiance, and moving paths record random numbers.
+    """
     return max(_bytes(Layout.of(trace, moves)) for moves in (False, True))
 
 
@@ -62,7 +65,10 @@ def _bytes(layout: Layout) -> int:
 
 
 def room_for(trace: TraceConfig) -> int:
-    """Return the number of vertices that fit; with media also two null boundaries per vertex, as convex media need."""
+    """Return the number of records per path: one per vertex, and with media also two null boundaries per vertex.
+
+    Two null boundaries per vertex suffice for convex media.
+    """
     if trace.media is None:
         return device_of(mi.variant()).room(max(trace.max_depth, 1))
     return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)
@@ -75,8 +81,8 @@ class Layout:
     variant: str
     moves: bool  # the path moves with the parameters
     resamples: bool  # BSDFs are sampled again in later passes
-    fixed: bool  # the light at surfaces is recorded, and rays that leave the scene reach no vertex
-    glows: bool  # the same, and some emitter is a surface
+    fixed: bool  # radiance from emitters is recorded as a value, and rays that leave the scene have no vertex
+    glows: bool  # fixed, and some emitter is a surface, so that emission at vertices is recorded
     media: bool
     chromatic: bool
     emissive: bool
@@ -137,7 +143,8 @@ FIELDS = (
     ("kept.media.shadow.length", "Float", "media"),
 )
 
-# Dr.Jit's local memory cannot hold Bool. These fields share a word, one bit each; the lobe takes the upper bits.
+# Dr.Jit's local memory does not support Bool. Each of these fields takes one bit of a word, whose upper bits contain
+# the lobe.
 BITS = (
     ("at.hit.valid", "always"),
     ("at.delta", "varies"),
@@ -197,13 +204,13 @@ def read_back(
 ) -> VertexRecord:
     """Read the vertex recorded at ``index``.
 
-    ``last`` is the index of the path's last vertex; time and wavelengths are those of the ray ``ray0``.
+    ``last`` is the index of the path's last vertex. Time and wavelengths are taken from ``ray0``.
     """
     v = _read(layout, records[index], ray0)
     if layout.fixed:
         return v
     onward = _read(layout, records[dr.minimum(index + 1, last)], ray0).at
-    # The record of the next vertex holds the continuation of this one.
+    # The record of the next vertex contains the continuation of this vertex.
     kept = replace(v.kept, d=onward.ray.d, delta=onward.delta)
     if layout.passes:
         kept.delta |= kept.media.null
@@ -226,7 +233,7 @@ def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> VertexRecord:
 
 
 def _blank(layout: Layout, ray0: mi.Ray3f) -> VertexRecord:
-    """Return an empty vertex, whose values remain in all fields that are not recorded."""
+    """Return a vertex with default values, which remain in all fields that are not recorded."""
     zero, no = mi.Float(0), mi.Bool(False)
     ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0), ray0.time, ray0.wavelengths)
     at = Arrival(ray, dr.zeros(mi.PreliminaryIntersection3f), zero, no, no)

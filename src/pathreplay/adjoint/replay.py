@@ -1,8 +1,9 @@
 """The replay driver: sample a path again with the same random numbers, and subtract the radiance of each vertex.
 
-This is path replay backpropagation (Vicini, Speierer, Jakob 2021). The first pass stores only L_0. The second pass
-recovers the radiance beyond each vertex by subtracting the contributions of the vertices before it. Memory does not
-depend on depth. If the path moves with the parameters, `replay_attached` recovers the adjoint of the ray as well.
+This is path replay backpropagation (Vicini, Speierer, Jakob 2021). The first pass stores only the radiance L_0 of the
+path. At each vertex, the second pass subtracts the contributions up to this vertex from L_0, and so recovers the
+radiance from the rest of the path. Memory does not depend on depth. If the path moves with the parameters,
+`replay_attached` recovers the adjoint of the ray as well.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ def replay(
     differentiated: visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and, with
     ``attach='none'``, all motion.
     """
-    path = PathState.begin(trace, start, sustained=trace.branch)  # branches get the same samples as in other drivers
+    # With null branching, paths continue as in the other drivers, so that the branch gets the same samples.
+    path = PathState.begin(trace, start, sustained=trace.branch)
     moves = path_moves(trace, start, path.at)
     if not moves:
         _replay_still(trace, start, path, δL)
@@ -69,10 +71,10 @@ def _warn_of_smooth_lobes() -> None:
 
 @dr.syntax
 def _replay_still(trace: TraceConfig, start: CameraStart, path: PathState, δL: mi.Spectrum) -> None:
-    """Replay a path that does not move.
+    """Replay a path that does not move with the parameters.
 
-    Computes β_{i+1} L_{i+1} = β_i L_i - β_i e_i and differentiates it as (β_i L_{i+1}) w_i through the relative
-    derivative of w_i.
+    At each vertex, β_{i+1} L_{i+1} = β_i L_i - β_i e_i is known. A change dw_i of the weight changes the radiance by
+    this value times dw_i / w_i.
     """
     sampler, ray0 = start.sampler, path.at.ray
     L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, updated at each vertex

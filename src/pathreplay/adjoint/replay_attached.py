@@ -1,12 +1,13 @@
 """Attached path replay: also recover the adjoint of the ray, by inverting one 4x4 Jacobian per vertex.
 
-The first pass stores L_0 and q_0 = δL·∂L_0/∂r_0. The second recovers ("peels") both beyond each vertex in turn,
+The first pass stores L_0 and q_0 = δL·∂L_0/∂r_0. At each vertex, the second pass computes radiance and ray adjoint of
+the next ray from those of the incident ray ("peeling"):
 
     β_{i+1} L_{i+1} = β_i L_i - β_i e_i,      (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i,      A_i = ∂r_{i+1}/∂r_i,
 
-where p_i = δL·∂(β_i e_i + β_i w_i L_{i+1})/∂r_i at fixed L_{i+1}. The noise ε_i has mean zero, and the first pass uses
-the same A_i + ε_i X_i, so that the expectation of q_0 is unchanged. This is the attached estimator of Vicini, Speierer
-and Jakob (2021). It serves as a baseline for comparison: the sweep driver needs no inverse.
+where p_i = δL·∂(β_i e_i + β_i w_i L_{i+1})/∂r_i at fixed L_{i+1}. `Recovery` describes the noise ε_i X_i. The noise has
+mean zero, and the first pass uses the same A_i + ε_i X_i, so that the expectation of q_0 is unchanged. This is the
+attached estimator of Vicini, Speierer and Jakob (2021). The sweep driver, which needs no inverse, is compared with it.
 """
 
 from __future__ import annotations
@@ -35,9 +36,10 @@ def replay_attached(
 ) -> None:
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start`` of a ``path``.
 
-    ``lost`` counts the paths on which some q was not finite and was dropped. The result is exact on chains of delta
-    lobes. At smooth lobes A_i has rank two: without noise q cannot be recovered, and with noise the result is unbiased
-    unless rounding errors, amplified, exceed it. Not differentiated: visibility, and weights that are exactly zero.
+    ``lost`` counts the paths on which some q was not finite and was dropped. The recovery is exact on chains of delta
+    lobes. At smooth lobes, A_i has rank two. Without noise, q cannot be recovered there. With noise, the result is
+    unbiased, as long as amplified rounding errors do not exceed it. Not differentiated: visibility, and weights that
+    are exactly zero.
     """
     scale = length_scale(trace.scene)
     again = start.sampler.clone()
@@ -47,7 +49,7 @@ def replay_attached(
     with dr.resume_grad():
         o, d = start.repeat()
         if dr.grad_enabled(o, d):
-            dr.eval(q, L, overflow)  # else each entry of the camera matrix runs the first pass again
+            dr.eval(q, L, overflow)  # without this, each entry of the camera matrix would run the first pass again
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
             backward(sum((q0[k] * x[k] for k in range(1, 4)), q0[0] * x[0]))

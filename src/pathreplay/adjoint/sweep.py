@@ -1,7 +1,8 @@
 """The sweep driver: record a path vertex by vertex, then back-propagate from its last vertex to the first.
 
-The record is in thread-local memory. Its size depends on ``max_depth`` and on the number of running threads, not on the
-number of paths. The reverse pass computes L_i = e_i + w_i L_{i+1} again, without any division or subtraction.
+The record is in thread-local memory. Its size depends on ``max_depth`` and on the number of running threads, and not on
+the number of paths. The reverse pass computes L_i = e_i + w_i L_{i+1} from the last vertex to the first, without
+division or subtraction.
 """
 
 from __future__ import annotations
@@ -26,11 +27,13 @@ def sweep(
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start``.
 
-    Returns whether the path moves with the parameters. If it does, ``lost`` counts the paths with a non-finite adjoint.
-    It also counts the paths that ended because they crossed too many null boundaries. ``seen`` collects radiance in
-    media for the baseline of later passes. A weight that is exactly zero keeps its derivative. Not differentiated:
-    visibility and, with ``attach='none'``, all motion.
-    Raises PathreplayError if ``max_depth`` exceeds `deepest`, or if no parameter reaches the paths.
+    Returns whether the path moves with the parameters. ``lost`` counts two kinds of paths. In media, these are paths
+    that were truncated because null boundaries filled the record (see `room_for`). If paths move, these are also paths
+    with a ray adjoint that was not finite and was set to zero. ``seen`` collects radiance in media for the baseline of
+    later passes. Weights that are exactly zero are differentiated. Not differentiated: visibility and, with
+    ``attach='none'``, all motion.
+
+    Raises PathreplayError if ``max_depth`` exceeds `deepest`, or if the paths depend on no parameter with gradients.
     """
     if trace.max_depth > deepest(trace):
         raise PathreplayError(

@@ -29,10 +29,11 @@ def first_walk(
 ) -> tuple[dr.Local[object], mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
     """Record a path from index ``first`` on.
 
-    Returns the records, their number, the radiance of the path, the radiance from beyond the last record (relative to
-    the throughput there), and the branch.
+    Returns the records, their number, the radiance of the path, the radiance from beyond the last record, and the
+    `Branch`. The radiance from beyond the last record does not include the throughput. ``lost`` counts the paths that
+    were truncated because the record was full.
 
-    All lanes of a packet write to the same index: otherwise, writes to local memory are lost (Dr.Jit 1.5).
+    All lanes of a packet must write to the same index. Otherwise writes to local memory are lost (Dr.Jit 1.5).
     """
     trace = replace(trace, background_apart=layout.fixed)
     L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance so far
@@ -78,7 +79,7 @@ class RecordedPath:
 
 @dataclass
 class PathAdjoint:
-    """Radiance along a ray of a path, and adjoints."""
+    """The state of the reverse pass: radiance along a ray of a path, and adjoints."""
 
     δL: mi.Spectrum  # adjoint of the radiance of the path
     L: mi.Spectrum  # radiance along the ray
@@ -96,8 +97,8 @@ def walk_back(
 ) -> PathAdjoint:
     """Back-propagate from the last recorded vertex to the first.
 
-    ``adjoint`` belongs to the ray that leaves the last vertex; the result belongs to the ray that arrives at the first.
-    With ``rays_only`` no parameter receives a gradient.
+    ``adjoint`` refers to the ray that leaves the last vertex, and the result to the ray that arrives at the first
+    vertex. With ``rays_only``, no parameter receives a gradient.
     """
     layout, records, first, count, last = path.layout, path.records, path.first, path.count, path.last
     ray0, δL, L, q = path.ray0, adjoint.δL, adjoint.L, adjoint.q
