@@ -1,20 +1,21 @@
 """`dielectric_ad`: Mitsuba's `dielectric` with a differentiable index of refraction.
 
-With η the interior over the exterior index, θ_i and θ_t the angles of incidence and refraction, F(θ_i, η) the
-unpolarised Fresnel reflectance and η_ti = 1/η (from outside) or η (from inside):
+Let η be the interior over the exterior index, θ_i and θ_t the angles of incidence and refraction, F(θ_i, η) the
+unpolarised Fresnel reflectance, and η_ti = 1/η (from outside) or η (from inside). The two lobes are
 
     reflection      wo = (-wi_x, -wi_y, wi_z)                            f = F · specular_reflectance
     transmission    wo = (-η_ti wi_x, -η_ti wi_y, -sign(wi_z) cos θ_t)   f = (1 - F) · specular_transmittance · s
 
-where s = η_ti² in radiance mode and 1 in importance mode. Flags and values are those of Mitsuba's plugin. So is the
-probability of reflection, F, with one exception: near the critical angle, coming from the denser side, transmission is
-sampled with a probability of at least 1/4. There dF is unbounded, and samples with the small probability 1 - F would
-carry nearly all of the derivative.
+where s = η_ti² in radiance mode and 1 in importance mode. Flags and values are the same as in Mitsuba's plugin. The
+probability of reflection is F, as in Mitsuba, with one exception. For rays from the denser side, below the critical
+angle, transmission is sampled with a probability of at least 1/4. Near the critical angle dF is unbounded, and samples
+with the small probability 1 - F would contribute nearly all of the derivative.
 
 Differentiated: wo and the weight with respect to `eta` and si.wi, and the weight with respect to the tints. *Not*
-differentiated: the probability of choosing a lobe (bs.pdf is detached and the weight is f / detach(pdf), so that its
-value is the tint while its derivative keeps the Fresnel term), and the onset of total internal reflection. F is
-continuous there, but an edge of the scene seen through the lobe is a boundary term of the integrator.
+differentiated: the probability of choosing a lobe, and the onset of total internal reflection. bs.pdf is detached, and
+the weight is f / detach(pdf). The value of the weight is therefore the tint (times s), while its derivative contains
+the Fresnel term. F is continuous at the onset of total internal reflection. An edge of the scene that is seen through
+the lobe is a boundary term of the integrator.
 """
 
 from __future__ import annotations
@@ -73,14 +74,14 @@ class DielectricAD:
     # ------------------------------------------------ parameters ------------------------------------------------
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
-        # Discontinuous, as in Mitsuba's other dielectrics: when refracted light moves, the edges seen in it move.
+        # Discontinuous, as in Mitsuba's other dielectrics: edges seen through the surface move with eta.
         cb.put("eta", self.eta, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
         for name in TINTS:
             if getattr(self, name) is not None:
                 cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        dr.make_opaque(self.eta)  # a literal would become a kernel constant and force recompilation after every update
+        dr.make_opaque(self.eta)  # a literal would become a kernel constant, and every update would recompile
 
     def to_string(self) -> str:
         lines = [f"  eta = {self.eta},"]
@@ -107,8 +108,8 @@ class DielectricAD:
 
         # Fresnel reflectance, and relative index along (it) and against (ti) the direction of travel
         F, cos_t, η_it, η_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.eta)
-        # Under total internal reflection F is 1 at any angle, but the derivative of mi.fresnel is rounding error
-        # divided by cos θ_i.
+        # Under total internal reflection, F is 1 at all angles. The derivative that mi.fresnel returns there is a
+        # rounding error divided by cos θ_i.
         F = dr.select(cos_t == 0, dr.detach(F), F)
 
         # Choose the lobe with a detached probability
@@ -120,7 +121,7 @@ class DielectricAD:
         if has_r and has_t:
             bs.pdf = dr.select(selected_r, p_r, 1 - p_r)
             weight = f / bs.pdf
-            # The quotient is 1 up to rounding unless p_r is clamped, and 0 / 0 where a probability is zero.
+            # If p_r is not clamped, the quotient is 1 up to rounding, or 0 / 0 where the probability is zero.
             weight = dr.replace_grad(dr.select(p_r == F, 1, weight), weight)
         else:
             bs.pdf = mi.Float(1)

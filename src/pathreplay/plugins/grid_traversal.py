@@ -1,10 +1,10 @@
 """Cell-by-cell ray traversal: free flight with local majorants, transmittance with local control densities.
 
-The traversal (Amanatides and Woo 1987) stores the cell and the distance. The distance at which axis k is crossed next
-is recomputed from the cell, t_k = (cell_k + [d_k > 0] - o_k) / d_k. Nothing is accumulated, so rounding errors do not
-grow, and every step leaves a cell for good, which bounds the number of steps.
+The state of the traversal (Amanatides and Woo 1987) is the cell and the distance. The distance to the next cell face of
+axis k is recomputed from the cell, as t_k = (cell_k + [d_k > 0] - o_k) / d_k, and not accumulated. Rounding errors
+therefore do not grow. Every step leaves a cell and never returns to it, which bounds the number of steps.
 
-All of this is detached, and runs inside symbolic loops.
+Callers detach all inputs, except those of `through`. All functions can be used inside symbolic loops.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from pathreplay.plugins.supergrid import Bounds
 
 T = TypeVar("T")
 
-#: Rate of residual collisions over the largest residual density. A factor of two halves the exponent of the variance; a
-#: factor of four costs more time than it saves noise (`pathreplay bench gridmedium`).
+#: Rate of residual collisions relative to the largest residual density. A factor of two halves the exponent of the
+#: variance. A factor of four costs more time than the lower noise saves (`pathreplay bench gridmedium`).
 DENSER = 2.0
-#: Largest relative variance that the crossing of one cell adds to the transmittance of a ray through its empty part. A
-#: ray crosses 10 to 50 cells. With the mean as control density regardless of this risk, dense grids with sharp edges
-#: produce extreme outliers.
+#: Largest value of ∫ (σ - c)²/m ds over one cell, if σ is the lowest density of the cell along the whole ray. This
+#: integral is about the relative variance that the cell adds to the transmittance (see `control`). A ray crosses 10 to
+#: 50 cells. With the mean as control density in all cells, dense grids with sharp edges produce extreme outliers.
 RISK = 0.1
-#: Estimates below this are continued with Russian roulette, which adds a variance of at most FAINT times the
+#: Russian roulette is applied to estimates below this value. It adds a variance of at most FAINT times the
 #: transmittance.
 FAINT = 1e-2
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Values per cell, ready for traversal.
+    """A lookup table of values per cell.
 
-    One layer of empty cells surrounds the grid, because rounding may carry a ray one cell too far. ``to_cell`` (3 x 4)
-    maps world space to cell space; ``shape`` is the number of cells along x, y, z; both include the layer. ``table``
-    (Float, flat) holds the same number of values for every cell, with x varying fastest.
+    One layer of empty cells surrounds the grid, because rounding may move a ray one cell too far. ``to_cell`` (3 x 4)
+    maps world space to cell space, and ``shape`` is the number of cells along x, y, z. Both include the layer.
+    ``table`` (Float, flat) contains the same number of values for every cell, with x varying fastest.
     """
 
     to_cell: NDArray[np.float64]
@@ -78,9 +78,10 @@ def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
 
 
 def through(box: mi.ScalarBoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
-    """Return the distances at which the line of a ray enters and leaves a box; the first is larger on a miss. Attached.
+    """Return the distances at which the line of a ray enters and leaves a box; on a miss, the first is larger.
 
-    Mitsuba's `BoundingBox.ray_intersect` does the same, but accepts only rays of the first variant set in the process.
+    Differentiable in the ray. Mitsuba's `BoundingBox.ray_intersect` computes the same distances, but accepts only rays
+    of the first variant that was set in the process.
     """
     near, far = mi.Float(-dr.inf), mi.Float(dr.inf)
     for k in range(3):
@@ -96,7 +97,7 @@ def through(box: mi.ScalarBoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Fl
 
 
 def clip(box: mi.ScalarBoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
-    """Return the part [a, b] of a ray inside a box, or a = 0, b = -1 on a miss. Never NaN for a finite ray."""
+    """Return the part [a, b] of a ray inside a box, or a = 0, b = -1 on a miss. No result is NaN for a finite ray."""
     near, far = through(box, ray)
     a, b = dr.fmax(near, 0), dr.fmin(far, ray.maxt)
     met = a < b
@@ -105,20 +106,20 @@ def clip(box: mi.ScalarBoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float
 
 @dataclass(frozen=True)
 class CellWalk:
-    """A ray in cell space: axis k is crossed at the distance cell_k · inverse_k + offset_k."""
+    """A ray in cell space. It leaves cell (i, j, k) along axis x at the distance i · inverse_x + offset_x."""
 
-    inverse: mi.Vector3f  # 1/d, 0 along axes on which the ray does not move
-    offset: mi.Vector3f  # ([d > 0] - o)/d, infinite on these axes
+    inverse: mi.Vector3f  # 1/d; 0 for axes perpendicular to the ray
+    offset: mi.Vector3f  # ([d > 0] - o)/d; infinite for axes perpendicular to the ray
     stride: mi.Vector3f  # the step from cell to cell, ±1
     start: mi.Vector3f  # the cell at the first distance
     end: mi.Float  # the distance at which the traversal ends
 
     def crossing(self, cell: mi.Vector3f) -> mi.Vector3f:
-        """Return the distances at which the ray crosses the next cell face of each axis."""
+        """Return the distances at which the ray crosses the next cell face perpendicular to each axis."""
         return dr.fma(cell, self.inverse, self.offset)
 
     def onward(self, cell: mi.Vector3f, crossings: mi.Vector3f, t: mi.Float) -> mi.Vector3f:
-        """Return the cell after the distance ``t``, which is at most the smallest crossing of this cell."""
+        """Return the cell of the ray after distance ``t``, which must not exceed the smallest of the ``crossings``."""
         return dr.select(crossings <= t, cell + self.stride, cell)
 
 
@@ -130,14 +131,14 @@ def begin(cells: Cells, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> CellWalk:
     offset = dr.select(still, dr.inf, (dr.select(forward, mi.Vector3f(1), mi.Vector3f(0)) - o) * inverse)
     inner = mi.Vector3f([n - 2 for n in cells.shape])
     start = dr.clip(dr.floor(dr.fma(d, a, o)), 1, inner)
-    # The end is the far side of the last inner cell, computed as in the traversal itself.
+    # The far side of the last inner cell limits the end. It is computed with the same rounding as in the traversal.
     last = dr.fma(dr.select(forward, inner, mi.Vector3f(1)), inverse, offset)
     stride = dr.select(forward, mi.Vector3f(1), mi.Vector3f(-1))
     return CellWalk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))
 
 
 def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Transform origin and direction of a ray by an affine map; zero matrix entries cost nothing."""
+    """Transform origin and direction of a ray by an affine map, omitting zero entries of the matrix."""
 
     def linear(row: NDArray[np.float64], v: mi.Vector3f) -> mi.Float:
         terms = [float(row[k]) * v[k] for k in range(3) if row[k] != 0]
@@ -153,10 +154,10 @@ def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi
 def free_flight(
     cells: Cells, box: mi.ScalarBoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool | bool
 ) -> tuple[mi.Float, mi.Float]:
-    """Sample the distance of the next tentative collision; return it and its majorant, or infinity and 0 without one.
+    """Sample the distance of the next tentative collision; return the distance and the majorant there.
 
-    The distance t solves ∫_0^t m ds = -log(1 - u), with m the value of the cell (1 / unit length), and 0 outside
-    ``box``.
+    The distance t solves ∫_0^t m ds = -log(1 - u). The majorant m (1 / unit length) is the value of the cell, and 0
+    outside ``box``. If there is no solution, the distance is infinite and the majorant 0.
     """
     a, b = clip(box, ray)
     τ = -dr.log(1 - u)
@@ -193,19 +194,19 @@ def free_flight(
 def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Compute control density c and residual collision rate m per cell, for the density ``scale`` times the volume.
 
-    The relative variance of the estimate is exp(∫ (σ - c)²/m ds) - 1. The mean density is the best control on average,
-    but in the empty part of a dense cell a ray sees (σ - c)²/m = c²/m. c therefore exceeds the lowest density only as
-    far as this term stays below RISK for a crossing of the cell.
+    The relative variance of the estimate is exp(∫ (σ - c)²/m ds) - 1. On average, the mean density is the best control.
+    However, a ray may pass through a part of the cell where σ is the lowest density of the cell, and there (σ - c)²/m
+    is large. c is therefore limited, such that the integral over this part does not exceed RISK for one cell.
     """
     lowest, highest = _scaled(bounds, scale)
-    length = 2 / bounds.faces_per_length  # a ray crosses three faces per 2 mean cell sides
+    length = 2 / bounds.faces_per_length  # twice the mean length of a ray in a cell
     room = dr.sqrt(RISK / length * (highest - lowest))  # m is at least highest - lowest
     c = dr.fmin(bounds.mean * scale, lowest + room)
     return c, DENSER * dr.fmax(highest - c, c - lowest)
 
 
 def majorants(bounds: Bounds, scale: mi.Float) -> mi.Float:
-    """Return an upper bound of the density per cell, or 0 where it is negative (an optimiser may overshoot)."""
+    """Return an upper bound of the density per cell, at least 0; an optimiser may make densities negative."""
     return dr.fmax(_scaled(bounds, scale)[1], 0)
 
 
@@ -225,8 +226,8 @@ def transmittance(
 ) -> mi.Spectrum:
     """Estimate exp(-∫ σ ds) along the ray per channel (UnpolarizedSpectrum) without bias: residual ratio tracking.
 
-    With control density c and rate m per cell (Novák et al. 2014), T = exp(-∫ c ds) Π (1 - (σ - c)/m), the product over
-    residual collisions with rate m. ``density(t, active)`` evaluates σ.
+    The estimate is T = exp(-∫ c ds) Π (1 - (σ - c)/m), with control density c and rate m per cell (Novák et al. 2014).
+    The product is over residual collisions, which have the rate m. ``density(t, active)`` evaluates σ.
     """
     a, b = clip(box, ray)
     trace = begin(cells, ray, a, b)
@@ -250,7 +251,7 @@ def transmittance(
         active &= hit | (t_next < trace.end)
         if dr.hint(hit, exclude=[cells, box, ray, trace, density]):
             T *= 1 - (density(t, mi.Mask(True)) - c) / m
-            # Russian roulette on small estimates
+            # Russian roulette for small estimates
             kept = dr.minimum(dr.max(dr.abs(T)) * dr.exp(-depth) / FAINT, 1)
             survives = sampler.next_1d() < kept
             T = dr.select(survives, T / kept, 0)

@@ -4,10 +4,10 @@ With V, A and Q the volumes `sigma_t`, `albedo` and `emission`, and s the `scale
 
     σ_t = s V(x),   σ_s = A(x) σ_t,   emitted radiance per unit length = Q(x)   (Q is not scaled) .
 
-Mitsuba's integrators use a global majorant and see no emission. Ours call `free_flight` (local majorants),
-`transmittance` (residual ratio tracking) and `emission_at`.
+Mitsuba's integrators use a global majorant and ignore the emission. The integrators of this package call `free_flight`
+(local majorants), `transmittance` (residual ratio tracking) and `emission_at`.
 
-Differentiated: the coefficients and the emission with respect to V, A, Q, s and the position. *Not* differentiated:
+The coefficients and the emission are differentiable with respect to V, A, Q, s and the position. *Not* differentiated:
 majorants, free-flight distances and the transmittance estimate (all detached), the bounding box and `to_world` of
 volumes.
 """
@@ -32,8 +32,8 @@ from pathreplay.plugins.supergrid import (
     voxel_bounds,
 )
 
-#: Half extent of a constant density given as a number: larger than any scene, and far from overflow. (A `constvolume`
-#: by default fills the unit cube only.)
+#: Half the side of the cube that a density given as a number fills. The value is larger than any scene, and far from
+#: overflow. Without a transform, a `constvolume` fills only the unit cube.
 FAR = 1e6
 
 
@@ -72,7 +72,7 @@ class GridMedium:
     def parameters_changed(self, keys: list[str]) -> None:
         if keys and "sigma_t" not in keys and "scale" not in keys:
             return
-        dr.make_opaque(self.scale)  # a literal would become a kernel constant and force recompilation at every update
+        dr.make_opaque(self.scale)  # a literal would become a kernel constant, and every update would recompile
         with dr.suspend_grad():
             if not keys or "sigma_t" in keys:
                 self.box = self.sigma_t.bbox()
@@ -83,7 +83,7 @@ class GridMedium:
     def _choose_cells(self) -> None:
         """Build tables of majorants and control densities for the current scale, each with the cheapest cell size."""
         scale = dr.detach(self.scale)
-        # With emission or gradients, empty cells need (null) collisions as well: one per crossing of the volume.
+        # With emission or gradients, empty cells need tentative collisions as well: one per mean chord of the box.
         with dr.resume_grad():
             params = mi.traverse(self.sigma_t)
             moves = dr.grad_enabled(self.scale) or any(dr.grad_enabled(params[key]) for key in params.keys())
@@ -96,7 +96,7 @@ class GridMedium:
         dr.make_opaque(self.majorant)
 
     def _cheapest_cells(self, values: Sequence[tuple[mi.Float, ...]]) -> grid_traversal.Cells:
-        """Return cells of the cheapest level; ``values`` has one tuple per level, with the collision rate last."""
+        """Return the cells of the cheapest level. ``values`` has one tuple per level; its last entry is the rate."""
         rates = [dr.mean(numbers[-1]) for numbers in values]
         dr.eval(values, rates)
         last = len(values) - 1
@@ -109,7 +109,7 @@ class GridMedium:
 
     @property
     def constants(self) -> tuple[object, ...]:
-        """Values that kernels treat as constants: a recorded kernel is invalid if they change."""
+        """Values that kernels treat as constants. A recorded kernel becomes invalid if one of them changes."""
         cells = self.flight_cells, self.shadow_cells
         box = *map(float, self.box.min), *map(float, self.box.max)
         return self.is_chromatic, box, *((table.shape, tuple(table.to_cell.ravel().tolist())) for table in cells)
@@ -140,9 +140,9 @@ class GridMedium:
     def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool | bool = True) -> tuple[mi.Float, mi.Float]:
         """Sample the distance to the next tentative collision, and return it with the local majorant. Detached.
 
-        The distance t solves ∫_0^t m ds = -log(1 - u). The local majorant m is at least σ_t in all channels, and 0
-        outside the medium's bounding box. If no t below ray.maxt solves this, the distance is infinite and the majorant
-        0. ``u`` lies in [0, 1).
+        The distance t solves ∫_0^t m ds = -log(1 - u), with ``u`` in [0, 1). The local majorant m is at least σ_t in
+        all channels, and 0 outside the medium's bounding box. If there is no solution below ray.maxt, the distance is
+        infinite and the majorant 0.
         """
         with dr.suspend_grad():
             return grid_traversal.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
@@ -170,7 +170,7 @@ class GridMedium:
 
 
 def _volume(props: mi.Properties, name: str, default: float | None) -> Any:
-    """Read the volume of that name, or None. Textures, colours and numbers become a very large `constvolume`."""
+    """Read the volume ``name``, or return None. Textures, colours and numbers become a very large `constvolume`."""
     value = props[name] if name in props else default
     if value is None or isinstance(value, mi.Volume):
         return value

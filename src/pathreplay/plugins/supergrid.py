@@ -1,11 +1,11 @@
 """Bounds of a volume's values in coarse cells, and the cell size for which delta tracking is cheapest.
 
-`voxel_bounds` computes, for every cell of BASE³ voxels, the lowest, mean and highest value that an interpolated lookup
-in it can return. `coarser` merges 2 x 2 x 2 cells. `cheapest` selects a size between these and a single cell.
+`voxel_bounds` computes the lowest, mean and highest value that an interpolated lookup in a cell of BASE³ voxels can
+return. `coarser` merges 2 x 2 x 2 cells. `cheapest` selects a cell size between BASE³ voxels and the whole volume.
 
-The bounds hold for both filters and all wrap modes of `gridvolume`, which does not expose them: a cell includes
-adjacent voxels and, beyond the faces of the grid, the values of every wrap mode. They also hold at least half a voxel
-beyond the faces of the cell, so that rounding in a traversal is harmless.
+`gridvolume` does not expose its filter and its wrap mode. The bounds are therefore valid for both filters and all wrap
+modes: a cell includes adjacent voxels and, beyond the faces of the grid, the values of every wrap mode. The bounds are
+also valid up to half a voxel beyond the faces of the cell, so that rounding in a traversal is harmless.
 
 Nothing here is differentiated.
 """
@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-#: Voxels along the side of the smallest cell. Half of it gives eight times as many cells, and more steps between them.
+#: Voxels along the side of the smallest cell. Half this size gives eight times as many cells, and twice as many steps.
 BASE = 4
 #: Lowest, mean and highest value (TensorXf, z y x), one entry per voxel or cell.
 Values: TypeAlias = "tuple[mi.TensorXf, mi.TensorXf, mi.TensorXf]"
@@ -36,9 +36,9 @@ STEP_COST = 0.15
 class Lattice:
     """Position of a volume's voxels in world space.
 
-    Voxel i of an axis covers [i, i + 1] in voxel space; its value is at the centre. ``to_voxel`` (3 x 4) maps world
-    space to voxel space. ``size`` is the size of the data. ``low`` and ``high`` (voxels, per axis x, y, z) cover the
-    volume's bounding box, which is larger than the grid if the grid is rotated in world space.
+    Voxel i of an axis covers [i, i + 1] in voxel space, and its value is the value at the centre. ``to_voxel`` (3 x 4)
+    maps world space to voxel space. ``size`` is the number of voxels along x, y, z. The voxels from ``low`` to ``high``
+    cover the volume's bounding box, which is larger than the grid if the grid is rotated in world space.
     """
 
     to_voxel: NDArray[np.float64]
@@ -75,7 +75,7 @@ class Bounds:
 
 
 def find_lattice(volume: mi.Volume, shape: tuple[int, ...]) -> Lattice | None:
-    """Determine the lattice of a `gridvolume` with data of shape (z, y, x, channels); None if that fails.
+    """Determine the lattice of a `gridvolume` with data of shape (z, y, x, channels); return None on failure.
 
     Mitsuba does not expose the volume's `to_world`. Its linear part is parsed from the volume's string representation,
     and the translation comes from the bounding box, which has full precision.
@@ -122,7 +122,7 @@ def constant_bounds(volume: mi.Volume, lowest: float, mean: float, highest: floa
 
 
 def voxel_bounds(lattice: Lattice, data: mi.TensorXf) -> Bounds:
-    """Compute bounds of the values ``data`` (z y x channels) in cells of BASE³ voxels."""
+    """Compute the bounds of ``data`` (z, y, x, channels) in cells of BASE³ voxels."""
     values = _channels(dr.detach(data))
     for axis, span in enumerate(zip(lattice.low, lattice.high, lattice.size, strict=True)):
         values = _merged(values, axis, _support(*span), _support(*span, neighbours=False))
@@ -161,8 +161,8 @@ def _channels(data: mi.TensorXf) -> Values:
         return 3 * (mi.TensorXf(data.array, data.shape[:3]),)
     channels = [data[..., k] for k in range(data.shape[3])]
     if len(channels) == 4:
-        # Coefficients of a spectrum with values between 0 and 1, and its factor; the spectrum is bounded by 0 and 1
-        # only.
+        # The channels are the three coefficients of a spectrum with values between 0 and 1, and a factor. Nothing but
+        # 0 and 1 is known to bound the spectrum.
         return dr.fmin(channels[3], 0), channels[3] * 0, channels[3]
     return reduce(dr.fmin, channels), reduce(operator.add, channels) / len(channels), reduce(dr.fmax, channels)
 
@@ -170,9 +170,9 @@ def _channels(data: mi.TensorXf) -> Values:
 def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np.int64]:
     """Return the voxels that lookups in each cell may use (cells x voxels), for the range low..high of an axis.
 
-    With trilinear interpolation these are the cell's own voxels and one more on either side. Outside the n voxels of
-    the axis, they are the last voxel (clamp), the voxel at the other end (repeat), or the mirror image. Short rows
-    repeat their entries.
+    With trilinear interpolation, a lookup uses the cell's own voxels and one more voxel on either side. A voxel outside
+    the n voxels of the axis is replaced by the last voxel (clamp), the voxel at the other end (repeat), or the mirror
+    image. Short rows repeat their entries.
     """
     rows = []
     for start in range(low, high, BASE):
@@ -188,7 +188,7 @@ def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np
 
 
 def _merged(values: Values, axis: int, near: NDArray[np.int64], inside: NDArray[np.int64]) -> Values:
-    """Merge along one axis (x, y, z): extremes over the indices in ``near``, means over those in ``inside``."""
+    """Merge values along one axis (x, y, z): extremes over the indices ``near``, means over the indices ``inside``."""
 
     def pool(value: mi.TensorXf, table: NDArray[np.int64], merge: Callable) -> mi.TensorXf:
         before = [slice(None)] * (2 - axis)
@@ -203,10 +203,11 @@ def _merged(values: Values, axis: int, near: NDArray[np.int64], inside: NDArray[
 
 
 def cheapest(levels: list[Bounds], rates: list[float], chord: float) -> int:
-    """Return the index of the level whose cells make a ray through the volume cheapest.
+    """Return the index of the level at which a ray through the volume has the lowest mean cost.
 
-    The cost is that of the tentative collisions, ``rates[i]`` per unit length on average, and of the steps between
-    cells, over the mean length ``chord`` of a ray in the volume. A single cell needs no steps.
+    The cost is the number of tentative collisions plus STEP_COST times the number of steps between cells. Level i has
+    ``rates[i]`` tentative collisions per unit length on average. ``chord`` is the mean length of a ray in the volume. A
+    single cell needs no steps.
     """
     costs = [
         rate * chord + (0 if level.is_single else STEP_COST * (1 + level.faces_per_length * chord))

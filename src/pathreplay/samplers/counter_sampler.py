@@ -1,4 +1,4 @@
-"""Counter-based random numbers: a pure function of key and index, for paths and boundary segments."""
+"""Counter-based random numbers for paths and boundary segments: a pure function of key and index."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import mitsuba as mi
 from pathreplay.samplers.streams import Stream
 
 STEPS = tuple(round(2**32 * (root % 1)) for root in ((1 + 5**0.5) / 2, 2**0.5))
-"""Steps of Kronecker lattices. They and 1 are linearly independent over the rationals: pairs also fill a square evenly.
-"""
+"""Steps of the Kronecker lattice. Both steps and 1 are linearly independent over the rationals, so that pairs of
+coordinates also fill the square evenly."""
 ROUNDS = 8
 """Rounds of the TEA cipher. With Mitsuba's default of 4, samples of neighbouring keys are correlated: shadows in
 two-bounce light were 4 % too weak."""
@@ -56,8 +56,8 @@ class CounterSampler:
 def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Return the key of the i-th segment of a pass.
 
-    It must not be a function of i ^ seed. Otherwise passes would assign the same set of keys to different segments, and
-    their mean would keep the error of a single pass.
+    The key must not be a function of i ^ seed. Otherwise all passes would use the same set of keys, assigned to
+    different segments, and the mean over passes would have the error of a single pass.
     """
     return mi.sample_tea_32(i, seed, ROUNDS)[0]
 

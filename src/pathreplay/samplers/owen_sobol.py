@@ -1,11 +1,11 @@
 """Owen-scrambled Sobol samples, stratified within each pixel and across pixels in Morton order.
 
-Each 2D sample of a path is a point of the Sobol (0,2)-sequence. Order and points are scrambled with a separate key per
-dimension pair ("Practical Hash-based Owen Scrambling", Burley 2020): different pairs are independent, each coordinate
-is uniform, and every mean is unbiased. Paths are numbered pixel by pixel in Morton order, so that samples are
-also stratified over square blocks of pixels ("Screen-space blue-noise diffusion of Monte Carlo sampling error via
-hierarchical ordering of pixels", Ahmed and Wonka 2020). This lowers the noise of sums over pixels, for example of
-gradients.
+Each 2D sample of a path is a point of the Sobol (0,2)-sequence. The order of the points and the points themselves are
+scrambled with a separate key per dimension pair ("Practical Hash-based Owen Scrambling", Burley 2020). Different pairs
+are therefore independent, each coordinate is uniform, and every mean is unbiased. Paths are numbered pixel by pixel in
+Morton order, so that samples are also stratified over square blocks of pixels ("Screen-space blue-noise diffusion of
+Monte Carlo sampling error via hierarchical ordering of pixels", Ahmed and Wonka 2020). This lowers the noise of sums
+over pixels, such as gradients.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class OwenSobolSampler:
         return mi.Point2f(_unit(_scrambled(x, key * 0x85EBCA6B)), _unit(_scrambled(_second(x), key * 0xC2B2AE35)))
 
     def _next(self) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return the key of the next dimension, and the bit-reversed path index, shuffled with that key."""
+        """Return the key of the next dimension, and the bit-reversed path index after a shuffle with this key."""
         key = mixed(self.key + self.drawn * _GOLDEN)
         self.drawn += 1
         return key, _permuted(self.reversed, key)
@@ -80,7 +80,7 @@ def _permuted(x: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
 
 
 def _scrambled(x: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
-    """Apply Owen scrambling: each bit affects lower bits only, so that dyadic intervals stay dyadic intervals."""
+    """Apply Owen scrambling: each bit affects lower bits only, so that dyadic intervals map to dyadic intervals."""
     return dr.brev(_permuted(dr.brev(x), key))
 
 

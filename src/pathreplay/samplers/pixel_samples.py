@@ -1,4 +1,4 @@
-"""Samples of all paths of a pixel in mutually independent sets, so that one set can weight the gradient of another."""
+"""Samples for all paths of a pixel in mutually independent sets, as `pixel_sweep` requires."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import mitsuba as mi
 from pathreplay.samplers.sampler import Sampler
 
 SETS = 4
-"""Number of low-discrepancy sets per pixel, if it has that many paths. With fewer sets, the weight of a path is the
-mean of fewer independent paths; with more, the samples of a set are less evenly distributed."""
+"""Number of low-discrepancy sets per pixel, or the number of its paths if this is smaller. With fewer sets, the adjoint
+of a path depends on fewer independent paths. With more sets, the samples of a set are less evenly distributed."""
 
 
 class PixelSamples(Protocol):

@@ -10,7 +10,7 @@ S = TypeVar("S")
 
 
 class Sampler(Protocol):
-    """Gives random numbers in [0, 1): a sampler of Mitsuba or of this package."""
+    """Generates random numbers in [0, 1). Samplers of Mitsuba and of this package have these methods."""
 
     def clone(self: S) -> S: ...
 

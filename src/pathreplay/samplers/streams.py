@@ -1,9 +1,9 @@
 """Streams: named, disjoint sequences of the counter-based samplers, one per purpose.
 
-The value of a stream is used in one of four ways. It is the first index of the stream in a key
-(`CounterSampler.stream`), it is combined with a seed or key by exclusive or, it is added to the state of a generator,
-or it is hashed into the key of a Sobol sampler. Index 0 of a key belongs to the path itself, with six samples per
-vertex (see `CounterSampler.at_vertex`).
+The value of a stream is used in one of four ways: as the first index of the stream in a key (`CounterSampler.stream`),
+combined with a seed or key by exclusive or, added to the state of a generator, or hashed into the key of a Sobol
+sampler. The indices from 0 on of a key belong to the path itself, with six samples per vertex (see
+`CounterSampler.at_vertex`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ class Stream(IntEnum):
     """Purposes of random number streams."""
 
     # Combined with the seed of a pass.
-    BOUNDARY = 0x5EED  # the boundary term, beside the interior
+    BOUNDARY = 0x5EED  # the boundary term; the interior term uses the seed itself
     FIRST_LOOK = 0x7F4A7C15  # pilot segments, whose results determine where later segments are sampled
     CAST_SHADOWS = 0x2C1B3C6D
     PRIMARY_KEYS = 0x51ED270B
