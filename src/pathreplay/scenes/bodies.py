@@ -1,4 +1,4 @@
-"""Generated meshes: a triangulated sphere, and an asymmetric body with knobs that looks different from every side."""
+"""Generated meshes: a triangulated sphere, and an asymmetric body with knobs that looks different from all sides."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _KNOBS = (  # direction, height, sharpness
 
 
 def ball(splits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) and faces (m, 3) on the unit sphere, from an octahedron subdivided ``splits`` times.
+    """Return vertices (n, 3) and faces (m, 3) of a unit sphere, from an octahedron subdivided ``splits`` times.
 
-    Each subdivision splits every face into four. Faces share vertices and are counter-clockwise seen from outside.
+    Each subdivision splits every face into four. Faces share vertices, and are counter-clockwise seen from outside.
     """
     v = np.concatenate([np.eye(3), -np.eye(3)])
     f = np.array([(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)])
@@ -31,7 +31,7 @@ def ball(splits: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def knobs(directions: np.ndarray) -> np.ndarray:
-    """Surface points of a body with four knobs of different size, in these directions (n, 3); the body is 1 long."""
+    """Return the surface points, in the given directions (n, 3), of a body of length 1 with four different knobs."""
     radius = np.full(len(directions), 0.4)
     for at, height, sharpness in _KNOBS:
         radius += height * np.exp(sharpness * (directions @ (np.array(at) / np.linalg.norm(at)) - 1))
@@ -40,7 +40,7 @@ def knobs(directions: np.ndarray) -> np.ndarray:
 
 
 def mesh(vertices: np.ndarray, faces: np.ndarray, bsdf: dict[str, object], flat: bool = False) -> mi.Mesh:
-    """A Mitsuba mesh, with vertex normals unless it is ``flat``."""
+    """Create a Mitsuba mesh, with vertex normals unless it is ``flat``."""
     props = mi.Properties()
     props["bsdf"], props["face_normals"] = mi.load_dict(bsdf), flat
     result = mi.Mesh("mesh", len(vertices), len(faces), props, has_vertex_normals=not flat)

@@ -16,38 +16,39 @@ COSTS: dict[str, Callable[[int], int]] = {
     "views": lambda n: 100_000 * n,  # a sensor with its film
     "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # eight faces, each split into four n times
 }
-"""Arguments that can make a scene too large -> approximate memory to build it, in bytes."""
+"""Arguments that determine the size of a scene -> approximate memory in bytes that is needed to build the scene."""
 
 
 def _picture(pixels: np.ndarray, **options: object) -> SceneDict:
-    """A bitmap texture whose values are used without colour conversion."""
+    """Describe a bitmap texture whose values are used without colour conversion."""
     return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, **options}
 
 
 def _centres(*counts: int) -> tuple[np.ndarray, ...]:
-    """Coordinates in [0, 1] of the cell centres of a grid, one array per axis."""
+    """Return the coordinates in [0, 1] of the cell centres of a grid, one array per axis."""
     return tuple(np.meshgrid(*((np.arange(n) + 0.5) / n for n in counts), indexing="ij"))
 
 
 def cornell_box(resolution: int = 256) -> SceneDict:
-    """Mitsuba's Cornell box: two white boxes, a red and a green wall, one area light."""
+    """Describe Mitsuba's Cornell box: two white boxes, a red and a green wall, one area light."""
     scene: SceneDict = mi.cornell_box()
     scene["sensor"]["film"].update(width=resolution, height=resolution)
     return scene
 
 
 def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
-    """The Cornell box with a grey texture (``texture`` x ``texture`` texels) on its back wall, seen by two sensors.
+    """Describe the Cornell box with a grey texture (``texture``² texels) on its back wall, seen by two sensors.
 
-    ``overview`` is the classic camera. ``closeup`` stands inside the box, behind the two white boxes, which are moved
-    to the front so that it sees every texel of the wall. Key of the texture: ``back.bsdf.reflectance.data``.
+    ``overview`` is the classic camera. ``closeup`` is inside the box, between the back wall and the two white boxes.
+    The boxes are moved to the front, so that this camera sees every texel of the wall. The key of the texture is
+    ``back.bsdf.reflectance.data``.
     """
     T = mi.ScalarTransform4f
     scene = cornell_box(resolution)
     overview = scene.pop("sensor")
-    # A texel is hardly wider than a pixel: a wider filter would blur neighbouring texels, which is slow to invert.
+    # A texel is hardly wider than a pixel. A wider filter would blur neighbouring texels, which slows down convergence.
     overview["film"]["rfilter"] = {"type": "box"}
-    # Distance 1.3 from the wall of half width 1: tan(fov / 2) = 1 / 1.3, plus a margin of 1 %.
+    # The distance from the wall is 1.3, and the wall's half width is 1: tan(fov / 2) = 1 / 1.3, plus a margin of 1 %.
     near = T().look_at(origin=[0, 0, 0.3], target=[0, 0, -1], up=[0, 1, 0])
     scene |= {"overview": overview, "closeup": {**overview, "to_world": near, "fov": 75.8}}
     scene["large-box"]["to_world"] = T().translate([-0.45, -0.65, 0.42]).rotate([0, 1, 0], 18).scale([0.26, 0.35, 0.26])
@@ -60,11 +61,11 @@ def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
 
 
 def _room(radius: float) -> SceneDict:
-    """An emissive sphere around the origin, poles above and below, with a smooth radiance texture.
+    """Describe an emissive sphere around the origin, with poles above and below and a smooth radiance texture.
 
-    The texture is smooth, so that an image tells the direction towards the optimum from far away. The sphere has finite
-    size, so that an image also depends on position. Radiance towards direction d, colour channel c: 0.6 + 0.08 Σ_j
-    cos(k_cj · d + φ_cj), with wavelengths of 30 to 90 degrees.
+    Because the texture is smooth, gradients point to the optimum from far away. Because the sphere has finite size, an
+    image also depends on the position of the camera. The radiance from direction d in colour channel c is 0.6 + 0.08
+    Σ_j cos(k_cj · d + φ_cj), with wavelengths of 30 to 90 degrees.
     """
     v, u = _centres(64, 128)
     θ, φ = np.pi * v, 2 * np.pi * u
@@ -90,19 +91,19 @@ def _camera(origin: list[float], target: list[float], fov: float, resolution: in
 
 
 def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
-    """A thick pane of glass (index 1.5) with an uneven front in a textured room, seen by three sensors.
+    """Describe a thick pane of glass (index 1.5) with an uneven front in a textured room, seen by three sensors.
 
-    ``front`` looks straight through the pane; ``left`` and ``right`` look at 55 degrees, where the thickness shifts the
-    view and the front reflects more of the room. This separates the index from the slope of the surface. Keys:
-    ``glass.eta`` and ``front_face.bsdf.normalmap.data``, ``texture`` x ``texture`` normals (n + 1) / 2 over the middle
-    of the pane.
+    ``front`` looks straight through the pane. ``left`` and ``right`` look at an angle of 55 degrees, where the
+    thickness shifts the view and the front reflects more of the room. These views separate the effect of the index from
+    the effect of the slope of the surface. The keys are ``glass.eta`` and ``front_face.bsdf.normalmap.data``. The
+    latter contains ``texture``² normals, stored as (n + 1) / 2, over the middle of the pane.
     """
     T = mi.ScalarTransform4f
-    # So wide that no path sees the rim; the corners stay inside the room.
+    # The pane is so wide that no path sees the rim, and its corners are inside the room.
     half, thick, distance = [2.8, 2.0, 1.0], 0.6, 2.9
     angle = np.radians(55)
     side = [float(distance * np.sin(angle)), 0.0, float(distance * np.cos(angle))]
-    # The normal map covers -0.8 to 0.8 in x and y. Beyond, where its flat border continues, the pane is visible, too.
+    # The normal map covers -0.8 to 0.8 in x and y. The rest of the pane is also visible, and continues the flat border.
     middle = T().translate([0.5, 0.5, 0]).scale([half[0] / 0.8, half[1] / 0.8, 1]).translate([-0.5, -0.5, 0])
     normals = _picture(_bumps(texture), wrap_mode="clamp", to_uv=middle)
     glass = {"type": "ref", "id": "glass"}
@@ -128,7 +129,10 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
 
 
 def _bumps(size: int) -> np.ndarray:
-    """Normal map of h(x, y) = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), w = (1 - x²)²(1 - y²)², flat at the border."""
+    """Return the normal map of the height h(x, y) = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), with w = (1 - x²)²(1 - y²)².
+
+    The height is flat at the border.
+    """
     y, x = (2 * centres - 1 for centres in _centres(size, size))
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -143,10 +147,10 @@ def _bumps(size: int) -> np.ndarray:
 
 
 def mirror_camera(resolution: int = 48) -> SceneDict:
-    """An old mirror with blotches in a textured room, seen by a fixed camera on a tripod and by a moving camera.
+    """Describe an old mirror with blotches in a textured room, seen by a fixed camera and by a camera that may move.
 
-    Both see the mirror and some of the room around it. The blotches determine the mirror's position in its plane. Keys:
-    ``camera.to_world`` and ``mirror.to_world``.
+    Both cameras see the mirror and a part of the room around it. The blotches make the image depend on the mirror's
+    position in its plane. The keys are ``camera.to_world`` and ``mirror.to_world``.
     """
     place = mi.ScalarTransform4f().translate([-0.4, -0.1, -1.0])
     blotches = _picture(_blotches(32))
@@ -165,17 +169,17 @@ def mirror_camera(resolution: int = 48) -> SceneDict:
 
 
 def _blotches(size: int) -> np.ndarray:
-    """Reflectance 0.7 + 0.15 (cos 9x sin 7y + sin(5x - 8y)), less in blue."""
+    """Return the reflectance 0.7 + 0.15 (cos 9x sin 7y + sin(5x - 8y)), slightly reduced in green and blue."""
     y, x = (2 * centres - 1 for centres in _centres(size, size))
     grey = 0.7 + 0.15 * (np.cos(9 * x) * np.sin(7 * y) + np.sin(5 * x - 8 * y))
     return (grey[:, :, None] * np.array([1, 0.97, 0.9])).astype(np.float32)
 
 
 def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
-    """A small cloud (``grid``³ voxels, albedo 0.95) under a sky with a sun, seen by ``views`` sensors around it.
+    """Describe a small cloud (``grid``³ voxels, albedo 0.95) under a sky with a sun, seen by ``views`` sensors.
 
-    The medium fills a cube of side 2 with a null boundary. Key of the density (extinction per length):
-    ``cloud.interior_medium.sigma_t.data``.
+    The medium fills a cube of side 2 with a null boundary, and the sensors surround the cube. The key of the density
+    (extinction per unit length) is ``cloud.interior_medium.sigma_t.data``.
     """
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     density = {"type": "gridvolume", "grid": mi.VolumeGrid(_cumulus(grid)), "to_world": place}
@@ -188,7 +192,7 @@ def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
     }
     for view in range(views):
         angle = 2 * np.pi * (view + 0.3) / views
-        # Alternate between views from below, the side and above: hidden parts are visible from other heights only.
+        # Views from below, the side and above alternate, because some parts are visible only from certain heights.
         height = (-1.6, 0.3, 2.2)[view % 3]
         origin = [float(4 * np.cos(angle)), height, float(4 * np.sin(angle))]
         scene[f"view{view + 1}"] = _camera(origin, [0, -0.1, 0], 34, resolution)
@@ -196,9 +200,10 @@ def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
 
 
 def silhouettes(resolution: int = 32, views: int = 2) -> SceneDict:
-    """A black body with four knobs, 1 long, in front of a white sky: only its silhouette is visible.
+    """Describe a black body of length 1 with four knobs in front of a white sky: only its silhouette is visible.
 
-    Key of its vertices: ``body.vertex_positions``. The cameras stand around it at equal angles (two: 90 degrees apart).
+    The key of the vertices is ``body.vertex_positions``. The cameras are placed around the body at equal angles. Two
+    cameras are 90 degrees apart.
     """
     black = {"type": "diffuse", "reflectance": 0.0}
     vertices, faces = ball(4)
@@ -216,10 +221,10 @@ def silhouettes(resolution: int = 32, views: int = 2) -> SceneDict:
 
 
 def shadows(resolution: int = 32, views: int = 4, ball_splits: int = 0) -> SceneDict:
-    """The body of `silhouettes`, black, above a white floor on which an area light casts its shadow.
+    """Describe the black body of `silhouettes` above a white floor, on which an area light casts the body's shadow.
 
-    Cameras look down on it from all sides. With ``ball_splits`` (4) a sphere with the same number of vertices replaces
-    the body: the initial value of an optimisation.
+    Cameras look down on the body from all sides. If ``ball_splits`` is not zero, a sphere replaces the body, as the
+    initial value of an optimisation. With ``ball_splits`` = 4, the sphere has as many vertices as the body.
     """
     T = mi.ScalarTransform4f
     vertices, faces = ball(ball_splits or 4)
@@ -247,9 +252,10 @@ def shadows(resolution: int = 32, views: int = 4, ball_splits: int = 0) -> Scene
 
 
 def silhouette_in_mirror(resolution: int = 32) -> SceneDict:
-    """The body of `silhouettes`, seen by one camera directly and, from its other side, in a mirror.
+    """Describe the body of `silhouettes`, seen by one camera directly and, from its other side, in a mirror.
 
-    The image is twice as wide as high. The mirror's rim is invisible, because it reflects its own surroundings.
+    The width of the image is twice its height. The rim of the mirror is invisible, because the mirror reflects the same
+    white sky that surrounds it.
     """
     scene = silhouettes(resolution, views=1)
     camera = _camera([0.5, 0, 4], [0.5, 0, 0], 36, resolution)
@@ -260,16 +266,17 @@ def silhouette_in_mirror(resolution: int = 32) -> SceneDict:
 
 
 def _panel(place: mi.ScalarTransform4f, *colour: float) -> SceneDict:
-    """A rectangle that glows in one colour and reflects nothing."""
+    """Describe a rectangle that emits light of one colour and reflects nothing."""
     black = {"type": "diffuse", "reflectance": 0.0}
     glow = {"type": "area", "radiance": {"type": "rgb", "value": list(colour)}}
     return {"type": "rectangle", "to_world": place, "bsdf": black, "emitter": glow}
 
 
 def flat_colours(resolution: int = 32) -> SceneDict:
-    """Emissive panels of one colour each at different distances in front of black: an image shows nothing but edges.
+    """Describe emissive panels of one colour each, at different distances before a black background.
 
-    The camera, key ``camera.to_world``, looks at them from three units away.
+    Images are piecewise constant, and only their edges move. The camera, with key ``camera.to_world``, looks at the
+    panels from a distance of three units.
     """
 
     def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> mi.ScalarTransform4f:
@@ -287,9 +294,9 @@ def flat_colours(resolution: int = 32) -> SceneDict:
 
 
 def glass_ball(resolution: int = 32) -> SceneDict:
-    """A glass sphere (index 1.5, radius 0.5) in front of single-colour panels: only its refraction makes it visible.
+    """Describe a glass sphere (index 1.5, radius 0.5) in front of panels of one colour each.
 
-    Keys: ``glass.eta`` and ``ball.to_world``.
+    The sphere is visible only because it refracts and reflects light. The keys are ``glass.eta`` and ``ball.to_world``.
     """
 
     def at(x: float, y: float, z: float, width: float, height: float) -> mi.ScalarTransform4f:
@@ -309,10 +316,11 @@ def glass_ball(resolution: int = 32) -> SceneDict:
 
 
 def _cumulus(size: int) -> np.ndarray:
-    """Extinction max(0, 8 b(y) Σ_i exp(-|x - c_i|² / r_i²) (0.75 + n(x)) - 1.5) at the voxel centres of [-1, 1]³.
+    """Return the extinction of a cloud at the voxel centres of [-1, 1]³, as an array of shape (z, y, x, 1).
 
-    Six Gaussian blobs, cut off below by b to a flat base; the noise n is a sum of 12 plane waves of wavelengths 0.5 to
-    1.2. The shape is (z, y, x, 1).
+    The extinction is max(0, 8 b(y) Σ_i exp(-|x - c_i|² / r_i²) (0.75 + n(x)) - 1.5). The sum is over six Gaussian
+    blobs. The factor b cuts off their lower part, so that the base is flat. The noise n is a sum of 12 plane waves with
+    wavelengths from 0.5 to 1.2.
     """
     z, y, x = (2 * centres - 1 for centres in _centres(size, size, size))
     shape = np.zeros_like(x)
@@ -332,13 +340,16 @@ def _cumulus(size: int) -> np.ndarray:
 
 
 def _sky(rows: int) -> np.ndarray:
-    """Blue above, dim below, with a sun 50 degrees above the horizon, blurred over 8 degrees so that paths hit it."""
+    """Return a sky that is blue above and dim below, with a sun at an elevation of 50 degrees.
+
+    The sun is blurred over 8 degrees, so that paths hit it.
+    """
     v, u = _centres(rows, 2 * rows)
     θ, φ = np.pi * v, 2 * np.pi * u
     d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)  # Mitsuba's envmap
     up = 0.5 + 0.5 * d[..., 1:2]
     sky = up * np.array([0.2, 0.3, 0.5]) + (1 - up) * np.array([0.14, 0.12, 0.11])
-    # On the side of the cameras that look up from below, so that no image contains it.
+    # The sun is on the side of the cameras that look up from below, so that no image contains the sun.
     elevation, azimuth = np.radians(50), np.radians(108)
     sun = np.array([np.cos(elevation) * np.cos(azimuth), np.sin(elevation), np.cos(elevation) * np.sin(azimuth)])
     glow = np.exp((d @ sun - 1) / (1 - np.cos(np.radians(8))))[..., None]

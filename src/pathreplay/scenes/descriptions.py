@@ -1,4 +1,4 @@
-"""Load objects from dictionaries, with checks for input that crashes Mitsuba, and report errors in one line."""
+"""Load objects from dictionaries, with checks for input that crashes Mitsuba and one-line error messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathreplay.errors import PathreplayError
 
 
 def require_values(description: Mapping[str, object]) -> None:
-    """Raise PathreplayError if a value of a dictionary, nested or not, is None: Mitsuba crashes on it (SIGSEGV)."""
+    """Raise PathreplayError if a dictionary, or one nested in it, contains None, which crashes Mitsuba (SIGSEGV)."""
     for name, value in description.items():
         if value is None:
             raise PathreplayError(
@@ -40,8 +40,8 @@ def load_integrator(description: Mapping[str, object]) -> mi.Integrator:
 def errors_as(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Iterator[None]:
     """Convert exceptions of these kinds into a PathreplayError whose message begins with ``what``.
 
-    The message is that of the first exception in the chain, because those that Dr.Jit's calls and loops raise
-    afterwards are uninformative. A Ctrl-C that Dr.Jit converted into such an exception is raised as KeyboardInterrupt.
+    The message quotes the first exception of the chain, because the exceptions that Dr.Jit's calls and loops raise
+    afterwards are uninformative. If Dr.Jit converted a Ctrl-C into such an exception, KeyboardInterrupt is raised.
     """
     try:
         yield
@@ -57,7 +57,7 @@ def errors_as(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -
 
 
 def one_line(error: BaseException) -> str:
-    """A Mitsuba or Dr.Jit error as one readable line, without C++ source positions and Python tracebacks."""
+    """Convert a Mitsuba or Dr.Jit error to one readable line, without C++ source positions and Python tracebacks."""
     text = str(error)
     if "PathreplayError: " in text:  # raised by one of our plugins: already a message for users
         return " ".join(text.rsplit("PathreplayError: ", 1)[1].split())

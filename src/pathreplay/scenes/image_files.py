@@ -1,6 +1,6 @@
-"""Headers of image files: size and storage format, read before any pixel is decoded.
+"""Read the headers of image files, for size and storage format, before any pixel is decoded.
 
-A file of a few hundred bytes can claim four billion pixels, and decoding it allocates memory for all of them.
+A file of a few hundred bytes can claim four billion pixels, and a decoder would allocate memory for all of them.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from pathreplay.platform import memory
 from pathreplay.scenes.tga_files import is_tga, require_sound_tga, tga_size
 
 MOST_PIXELS = 2**27
-"""Largest number of pixels of an image that is to be resized."""
+"""Default limit on the number of pixels of an image."""
 _A_PIXEL = 32
-"""Bytes per pixel while an image is read: the stored format, and single precision, which is copied once."""
+"""Bytes per pixel while an image is read: the stored format, and two copies in single precision."""
 MOST_HEAD = 2**16
-"""Bytes within which a text header has to end."""
+"""Largest size of a text header in bytes."""
 _MOST_PARTS = 2**12
 """Largest number of JPEG segments or EXR attributes before the size. Real files have about twenty."""
 
@@ -32,7 +32,7 @@ _RESOLUTION = re.compile(r"([+-])([XY]) (\d{1,10}) ([+-])([XY]) (\d{1,10})")
 
 @dataclass(frozen=True)
 class PixmapHead:
-    """The header of a binary PGM or PPM."""
+    """The header of a binary PGM or PPM file."""
 
     channels: int
     width: int
@@ -48,9 +48,10 @@ class RadianceHead:
     """The header of a Radiance HDR image."""
 
     axes: str
-    """Axes of the scanlines and of the pixels in a scanline: YX or XY."""
+    """Order of the axes in the file: YX if scanlines are rows, XY if scanlines are columns."""
     signs: str
-    """Directions of both axes. Rows from top to bottom have -Y, columns from left to right +X."""
+    """Signs of both axes, in the same order. Y is negative for rows from top to bottom, X is positive from left to
+    right."""
     counts: tuple[int, int]
     """Number of scanlines, and of pixels per scanline."""
     exposure: float
@@ -62,7 +63,7 @@ class RadianceHead:
 
 
 def pixmap_head(data: bytes) -> PixmapHead:
-    """The header of a PGM or PPM, with comments. Raises ValueError."""
+    """Parse the header of a PGM or PPM file, which may contain comments. Raises ValueError if there is none."""
     if not (match := _PIXMAP.match(data)) or not 0 < int(match[4]) < 2**16:
         raise ValueError("it has no PGM or PPM header")
     width, height, highest = (int(match[n]) for n in (2, 3, 4))
@@ -70,7 +71,10 @@ def pixmap_head(data: bytes) -> PixmapHead:
 
 
 def radiance_head(data: bytes) -> RadianceHead:
-    """The header of a Radiance image: lines, an empty line, and the resolution. Raises ValueError."""
+    """Parse the header of a Radiance image: text lines, an empty line, and the resolution.
+
+    Raises ValueError for a header that is missing or has invalid values.
+    """
     text, gap, rest = data.partition(b"\n\n")
     resolution, end, _ = rest.partition(b"\n")
     match = _RESOLUTION.fullmatch(resolution.decode("latin-1"))
@@ -94,7 +98,7 @@ def radiance_head(data: bytes) -> RadianceHead:
 
 
 def size_of_picture(path: Path) -> tuple[int, int] | None:
-    """Width and height from the header of a file; None for an unknown format.
+    """Read width and height from the header of a file; return None for an unknown format.
 
     Raises PathreplayError if the format is known and the header contains no size.
     """
@@ -108,7 +112,7 @@ def size_of_picture(path: Path) -> tuple[int, int] | None:
 def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
     """Raise PathreplayError for an image without pixels, with more than ``pixels``, or too large for the memory.
 
-    Also raises it for a TGA that Mitsuba would decode beyond its last pixel.
+    Also raise PathreplayError for a TGA whose runs Mitsuba would decode beyond the last pixel of the image.
     """
     size = size_of_picture(path)
     if size is None:
@@ -123,7 +127,7 @@ def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
 
 
 def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
-    """Width and height; raises struct.error, ValueError or IndexError for a damaged header."""
+    """Parse width and height; raises struct.error, ValueError or IndexError for a damaged header."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return struct.unpack_from(">II", data, 16)
     if data[:2] == b"\xff\xd8":
@@ -149,7 +153,7 @@ def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
 
 
 def _jpeg_size(file: BinaryIO) -> tuple[int, int]:
-    """Size from the frame header, which follows other segments."""
+    """Parse the size in the frame header, which follows other segments."""
     file.seek(2)
     for _ in range(_MOST_PARTS):
         if file.read(1) != b"\xff":
@@ -165,7 +169,10 @@ def _jpeg_size(file: BinaryIO) -> tuple[int, int]:
 
 
 def _exr_size(file: BinaryIO) -> tuple[int, int]:
-    """Size from the data window, an attribute of the first header: name, type, length of the value, value."""
+    """Parse the size in the data window, an attribute of the first header.
+
+    An attribute consists of its name, its type, the length of its value, and the value.
+    """
     file.seek(8)
     for _ in range(_MOST_PARTS):
         name, kind = _text(file), _text(file)
@@ -178,7 +185,7 @@ def _exr_size(file: BinaryIO) -> tuple[int, int]:
 
 
 def _text(file: BinaryIO) -> bytes:
-    """Read up to the next zero byte, which must be near."""
+    """Read a zero-terminated string of at most 255 bytes."""
     begin, text = file.tell(), file.read(256).split(b"\0")[0]
     file.seek(begin + len(text) + 1)
     return text

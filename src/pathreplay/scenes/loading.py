@@ -1,4 +1,4 @@
-"""Load scenes by name or file, with parameter keys preserved: the single entry point of all commands."""
+"""Load scenes from files, dictionaries or the names of built-in scenes, and preserve the keys of parameters."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _COARSE = "BitmapTextureImpl[uint8]"
 
 
 def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: object) -> mi.Scene:
-    """Load a scene so that its parameter keys keep the names in the file.
+    """Load a scene whose parameter keys contain the names in the file.
 
-    ``spec`` is the path of a Mitsuba XML file (relative paths start at ``base``, or at the current folder) or the name
-    of a built-in scene (see ``BUILTINS``). ``parameters`` replace ``$name`` in the file, or are the arguments of the
-    built-in. Needs an active Mitsuba variant.
+    ``spec`` is the path of a Mitsuba XML file, relative to ``base`` (default: the current folder), or the name of a
+    built-in scene (see ``BUILTINS``). ``parameters`` are the values of ``$name`` in the file, or the arguments of the
+    built-in scene. A Mitsuba variant must be active.
 
     Raises PathreplayError if the scene does not exist, a parameter is wrong, Mitsuba cannot read the scene, or no
     variant is active.
@@ -48,9 +48,10 @@ def load_scene_with(
     /,
     **parameters: object,
 ) -> tuple[mi.Scene, list[str]]:
-    """`load_scene` with plugins replaced (old type -> new type); also returns id and position of each, one line each.
+    """Load a scene like `load_scene`, with some plugins replaced (``plugins``: old type -> new type).
 
-    ``spec`` may also be a dictionary. ``cameras`` are added to those of the scene. For ``floats`` see `load_file_with`.
+    ``spec`` may also be a dictionary. ``cameras`` are added to the sensors of the scene. For ``floats`` see
+    `load_file_with`. Returns the scene and one line per replaced plugin, with its id and position.
     """
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
@@ -77,7 +78,7 @@ def load_scene_with(
 
 
 def _copied(description: Mapping[str, object]) -> SceneDict:
-    """Copy a dictionary and its tensors: Mitsuba moves tensors out of a dictionary that it loads."""
+    """Copy a dictionary and its tensors, because Mitsuba moves tensors out of a dictionary that it loads."""
     return {
         name: _copied(value) if isinstance(value, Mapping) else type(value)(value) if dr.is_array_v(value) else value
         for name, value in description.items()
@@ -85,7 +86,7 @@ def _copied(description: Mapping[str, object]) -> SceneDict:
 
 
 def as_xml_has_them(parameters: Mapping[str, object]) -> dict[str, str]:
-    """Scene parameters as XML text: true instead of True."""
+    """Convert scene parameters to XML text, for example True to 'true'."""
     return {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
 
 
@@ -99,11 +100,11 @@ def load_scene_for(
 ) -> tuple[mi.Scene, tuple[str, ...]]:
     """Load a scene in which ``wanted`` keys and globs are differentiable, replacing plugins where that is necessary.
 
-    Where a pattern ending in ``eta`` matches the index of a ``dielectric``, the scene is loaded again with
-    `dielectric_ad` in place of every ``dielectric``. Where one ending in ``data`` matches an 8-bit texture, it is
-    loaded again with floating-point texels. ``cameras`` are added to those of the scene. Returns the scene and a note
-    on each change, one line each. Patterns without a match are left to the caller to report. Raises the same errors as
-    `load_scene`.
+    If a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded again with
+    `dielectric_ad` in place of every ``dielectric``. If a pattern that ends in ``data`` matches an 8-bit texture, the
+    scene is loaded again with floating-point texels for this texture. ``cameras`` are added to the sensors of the
+    scene. Returns the scene and a one-line note per kind of change. A pattern without a match causes no error here.
+    Raises the same errors as `load_scene`.
     """
     scene, _ = load_scene_with(spec, {}, base, cameras, **parameters)
     params = traversed(scene)
@@ -112,8 +113,8 @@ def load_scene_for(
     plugins, floats = {"dielectric": "dielectric_ad"} if smooth else {}, coarse_pictures(params, wanted)
     if not plugins and not floats:
         return scene, ()
-    # Dr.Jit traces virtual calls through every live instance, so the first scene must be freed before loading the
-    # second.
+    # Dr.Jit traces virtual calls through every live instance. The first scene must therefore be freed before the second
+    # is loaded.
     del scene, params
     gc.collect()
     scene, exchanged = load_scene_with(spec, plugins, base, cameras, floats, **parameters)
@@ -127,7 +128,7 @@ def load_scene_for(
 def load_scene_with_floats(
     spec: str | Path, wanted: Iterable[str], base: Path | None = None, /, **parameters: object
 ) -> mi.Scene:
-    """`load_scene` with floating-point texels in those 8-bit textures that ``wanted`` keys and globs name."""
+    """Load a scene like `load_scene`, with floating-point texels in 8-bit textures that match ``wanted`` (globs)."""
     scene = load_scene(spec, base, **parameters)
     if not (floats := coarse_pictures(traversed(scene), wanted)):
         return scene
@@ -137,14 +138,14 @@ def load_scene_with_floats(
 
 
 def coarse_pictures(params: mi.SceneParameters, wanted: Iterable[str]) -> tuple[str, ...]:
-    """Files of the 8-bit textures that keys and globs ending in ``data`` name."""
+    """Return the files of the 8-bit textures that match keys and globs ending in ``data``."""
     owners = [params.properties[key][2] for key in _matching(params, wanted, "data")]
     matches = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
     return tuple(dict.fromkeys(match[1] for match in matches if match))
 
 
 def _matching(params: mi.SceneParameters, wanted: Iterable[str], name: str) -> list[str]:
-    """Keys that match the patterns whose last part is ``name``."""
+    """Return the keys that match those patterns whose last part is ``name``."""
     keys: list[str] = []
     for pattern in wanted:
         if pattern.rsplit(".", 1)[-1] == name:
@@ -154,7 +155,7 @@ def _matching(params: mi.SceneParameters, wanted: Iterable[str], name: str) -> l
 
 
 def builtin_dict(name: str, parameters: Mapping[str, object]) -> SceneDict:
-    """The dictionary of a built-in scene. Raises PathreplayError for a wrong parameter."""
+    """Return the dictionary of a built-in scene. Raises PathreplayError for a wrong parameter."""
     make = BUILTINS[name]
     known = inspect.signature(make).parameters
     for key, value in parameters.items():

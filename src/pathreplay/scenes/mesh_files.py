@@ -1,4 +1,4 @@
-"""Checks of PLY files and Mitsuba's serialized meshes before Mitsuba reads them without validating indices."""
+"""Check the indices of PLY files and serialized meshes, because Mitsuba reads them without validation."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class _Element:
     name: str
     count: int
     properties: list[tuple[str, ...]]
-    """As in the header: a type and a name, or 'list', two types and a name."""
+    """Each property as in the header: a type and a name, or 'list', two types and a name."""
 
     @property
     def kinds(self) -> list[str]:
         return [kinds[0] for kinds in self.properties]
 
     def layout(self, form: str) -> np.dtype[np.void]:
-        """Data type of one entry, with lists of three items. Numbers in text files are read in double precision."""
+        """Return the data type of one entry; lists have three items, and numbers in text files double precision."""
         order = "<" if form == "binary_little_endian" else ">"
         fields: list[tuple[str, str] | tuple[str, str, int]] = []
         for i, (*kinds, _) in enumerate(self.properties):
@@ -60,7 +60,7 @@ def require_sound_ply(path: Path) -> None:
         try:
             indices = _triangles(file, elements, form)
         except (KeyError, ValueError, IndexError):
-            return  # unknown to us, possibly known to Mitsuba
+            return  # Mitsuba may support this file although this reader does not
     if indices is not None:
         _require_vertices(path, indices, vertices)
 
@@ -81,10 +81,13 @@ def _ply_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
 
 
 def _triangles(file: BinaryIO, elements: list[_Element], form: str) -> np.ndarray | None:
-    """Vertex indices of the faces, (n, 3); None for missing data or non-triangular faces, which Mitsuba rejects."""
+    """Read the vertex indices of the faces, (n, 3).
+
+    Returns None for missing data or non-triangular faces, which Mitsuba rejects.
+    """
     vertex, face = (element.layout(form) for element in elements[:2])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # numpy warns where numbers end and text begins
+        warnings.simplefilter("ignore")  # NumPy warns if text follows the numbers
         text = form == "ascii"
         data = np.fromfile(file, np.float64, sep=" ") if text else np.memmap(file, np.uint8, "r", file.tell())
     skipped, faces = vertex.itemsize * elements[0].count, elements[1].count
@@ -95,7 +98,7 @@ def _triangles(file: BinaryIO, elements: list[_Element], form: str) -> np.ndarra
     return entries[f"{at}"] if (entries[f"count {at}"] == 3).all() else None
 
 
-# First bytes of a file of version 3 or 4 -> bytes per entry of the table at its end.
+# First bytes of a serialized mesh file (version 3 or 4) -> bytes per entry of the table of shapes at its end.
 _ENTRIES = {b"\x1c\x04\x03\0": 4, b"\x1c\x04\x04\0": 8}
 
 
@@ -116,7 +119,7 @@ def require_sound_serialized(path: Path, index: object) -> None:
             f"Mesh {path} of {size} bytes should contain {count} shapes; it is damaged, write it again"
         )
     try:
-        # With face normals Mitsuba does not compute vertex normals, which would use the unchecked indices.
+        # With face normals, Mitsuba does not compute vertex normals. That computation would use the unchecked indices.
         description = {"type": "serialized", "filename": str(path), "shape_index": index, "face_normals": True}
         mesh = mi.load_dict(description)
     except RuntimeError:

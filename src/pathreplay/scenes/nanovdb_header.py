@@ -1,8 +1,8 @@
 """Validate the headers of a NanoVDB file, because the reader crashes on a damaged one.
 
-A file is a sequence of segments. Each has 16 bytes (magic, version, number of grids, compression), a description of
-every grid (176 bytes and a name), and the grids. A grid begins with a header of 672 bytes, which is followed by the
-positions of its tree nodes.
+A file is a sequence of segments. A segment consists of a header of 16 bytes (magic, version, number of grids,
+compression), a description of every grid (176 bytes and a name), and the grids. A grid begins with a header of 672
+bytes, which is followed by the positions of its tree nodes.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ MAJOR = 32
 """Major version of the format, the upper 11 bits of the version number in the file."""
 NONE, ZIP = 0, 1
 
-# The largest compression ratio of zip is 1032.
+# Largest compression ratio of zip.
 _MOST_PACKED = 1032
 
 _SEGMENT = struct.Struct("<8sIHH")
-# Size in memory and in the file, hash of the name, voxels, type, class; then two boxes and the voxel size, which are
-# skipped, and the length of the name.
+# Size in memory, size in the file, hash of the name, number of voxels, type, class, and length of the name. Two boxes
+# and the voxel size precede the length of the name and are skipped.
 _GRID = struct.Struct("<4Q2I96xI36x")
 _GRID_HEADER = 672
-# Offsets of leaves, lower nodes, upper nodes and root from this position, and the counts of the first three.
+# Offsets of leaves, lower nodes, upper nodes and root, relative to the position of this structure, and the numbers of
+# leaves, lower nodes and upper nodes.
 _TREE = struct.Struct("<4Q3I")
 _FLOAT, _FLOAT_SIZES = 1, (2144, 33856, 270400)
 
@@ -44,8 +45,8 @@ class _Place(NamedTuple):
 def require_whole_nanovdb(path: Path) -> bool:
     """Check headers, sizes and tree positions of a NanoVDB file; return whether its first grid is compressed.
 
-    Zip-compressed grids are decompressed, which verifies their checksum. Values, and links inside an uncompressed tree,
-    are not checked.
+    Zip-compressed grids are decompressed, which verifies their checksum. Not checked are values, and links inside an
+    uncompressed tree.
 
     Raises PathreplayError if the file is not NanoVDB, has an unknown version, or is damaged.
     """

@@ -27,7 +27,7 @@ T = TypeVar("T")
 SceneValue: TypeAlias = "dr.ArrayBase | mi.Transform4f"
 """A differentiable value of `mi.SceneParameters`."""
 
-# Remedies for values that Mitsuba 3.9 stores without derivative: (class of the owner, last part of the key).
+# Remedies for values that Mitsuba 3.9 stores without derivatives, by (class of the owner, last part of the key).
 _WAY_OUT = {
     ("SmoothDielectric", "eta"): (
         "BSDF 'dielectric' stores it as a plain number; use BSDF 'dielectric_ad' of this package instead, "
@@ -51,13 +51,13 @@ _WAY_OUT = {
 
 
 def resolve_keys(params: Mapping[str, object], patterns: str | Iterable[str]) -> list[str]:
-    """The keys that match ``patterns``, in the order of the patterns, then of the scene; each key once.
+    """Return the keys that match ``patterns``, without duplicates, in the order of the patterns.
 
-    A pattern is an exact key or a shell-style glob (``*``, ``?``, ``[abc]``). Globs match whole keys, dots included.
-    Names may contain brackets: if a glob matches nothing, its brackets are taken literally. ``params`` is the result of
-    ``mi.traverse(scene)``.
+    A pattern is an exact key or a shell-style glob (``*``, ``?``, ``[abc]``). The keys that match one glob are in the
+    order of the scene. Globs match whole keys, including dots. Names may contain brackets: if a glob matches nothing,
+    its brackets are treated as literal characters. ``params`` is the result of ``mi.traverse(scene)``.
 
-    Raises PathreplayError, with the nearest keys, if a pattern matches nothing.
+    Raises PathreplayError, which lists the nearest keys, if a pattern matches nothing.
     """
     known = list(params.keys())
     selected: dict[str, None] = {}
@@ -72,15 +72,15 @@ def resolve_keys(params: Mapping[str, object], patterns: str | Iterable[str]) ->
 
 
 def keep_only(params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Reduce ``mi.traverse(scene)`` to exactly these keys; Mitsuba's own ``keep`` treats them as regexes."""
+    """Reduce ``mi.traverse(scene)`` to exactly these keys; Mitsuba's ``keep`` treats keys as regular expressions."""
     params.keep([rf"{re.escape(key)}\Z" for key in keys])
 
 
 def _no_match(known: list[str], pattern: str) -> str:
     if not known:
         return f"No parameter '{pattern}': the scene has no parameters"
-    # Lower case, so that a wrong capital does not hide the neighbour. 0.5 lets 'red.bsdf' find
-    # 'red.bsdf.reflectance.value'.
+    # Keys are compared in lower case, so that a wrong capital letter does not matter. With a cutoff of 0.5, 'red.bsdf'
+    # is similar to 'red.bsdf.reflectance.value'.
     lower = {key.lower(): key for key in known}
     close = [lower[match] for match in difflib.get_close_matches(pattern.lower(), lower, n=3, cutoff=0.5)]
     if close:
@@ -89,15 +89,15 @@ def _no_match(known: list[str], pattern: str) -> str:
 
 
 def owner_class(params: mi.SceneParameters, key: str) -> str:
-    """Name of the class that owns a parameter (not of the plugin: 'SmoothDielectric', not 'dielectric')."""
+    """Return the name of the class that owns a parameter, for example 'SmoothDielectric' for plugin 'dielectric'."""
     return str(params.properties[key][2].class_name())
 
 
 def require_differentiable(params: mi.SceneParameters, key: str, integrator: mi.Integrator | None = None) -> None:
-    """Raise PathreplayError unless ``integrator`` (None: any of Mitsuba's) can differentiate ``key``.
+    """Raise PathreplayError unless ``integrator`` (None: any integrator of Mitsuba) can differentiate ``key``.
 
-    It cannot if the key does not exist, is a plain number, holds integers, or is marked
-    ``mi.ParamFlags.NonDifferentiable``. Where a replacement exists, the message names it.
+    Not differentiable are missing keys, plain numbers, integers, empty arrays, and most parameters with the flag
+    ``mi.ParamFlags.NonDifferentiable`` (see `carries_derivative`). The message names a remedy if there is one.
     """
     if key not in params:
         raise PathreplayError(_no_match(list(params.keys()), key))
@@ -138,9 +138,9 @@ def require_settable(params: mi.SceneParameters, key: str) -> None:
 def resolve_differentiable(
     params: mi.SceneParameters, patterns: str | Iterable[str], integrator: mi.Integrator | None = None
 ) -> list[str]:
-    """Like :func:`resolve_keys`, but a glob selects only matches that carry a derivative.
+    """Return the differentiable keys among those that `resolve_keys` returns.
 
-    Raises PathreplayError if a pattern matches nothing, or nothing that carries a derivative.
+    Raises PathreplayError if a pattern matches nothing, or nothing that is differentiable.
     """
     selected: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
@@ -153,10 +153,11 @@ def resolve_differentiable(
 
 
 def carries_derivative(params: mi.SceneParameters, key: str, integrator: mi.Integrator | None = None) -> bool:
-    """Whether a parameter is differentiable: a non-empty Dr.Jit float array that Mitsuba does not exclude.
+    """Return whether a parameter is differentiable.
 
-    Of the parameters that Mitsuba excludes, ``pathreplay`` (unless ``attach`` is 'none') differentiates cameras and the
-    motion of emitters.
+    Differentiable parameters are non-empty Dr.Jit float arrays without the flag ``mi.ParamFlags.NonDifferentiable``.
+    Cameras and the motion of emitters have this flag, but ``pathreplay`` differentiates them unless ``attach`` is
+    'none'.
     """
     if not _is_float(params[key]) or is_empty(params[key]):
         return False
@@ -165,29 +166,32 @@ def carries_derivative(params: mi.SceneParameters, key: str, integrator: mi.Inte
     return getattr(integrator, "moves_rays", False) and needs_ray_adjoint(params, key)
 
 
-# Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. tests/scenes/test_cameras_and_lights.py
-# compares each with finite differences.
+# Parameters that Mitsuba marks as NonDifferentiable, because its integrators drop their derivatives.
+# tests/scenes/test_cameras_and_lights.py compares the derivative of each parameter with finite differences.
 _PRINCIPAL_POINT = {"principal_point_offset_x", "principal_point_offset_y"}
 _CAMERA = {"to_world", "x_fov", "aperture_radius", "focus_distance"} | _PRINCIPAL_POINT
 _LIGHT = {"to_world", "position"}
 
 
 def needs_ray_adjoint(params: mi.SceneParameters, key: str) -> bool:
-    """Whether a parameter belongs to a camera or moves an emitter without a shape; Mitsuba's integrators drop these."""
+    """Return whether a parameter belongs to a camera, or moves an emitter without a shape.
+
+    The derivatives of these parameters depend on the adjoints of rays, which Mitsuba's integrators do not compute.
+    """
     node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
     placed = (isinstance(node, mi.Sensor) and name in _CAMERA) or (isinstance(node, mi.Emitter) and name in _LIGHT)
     return placed and _is_float(params[key])
 
 
 def is_transform(value: object) -> TypeIs[mi.Transform4f]:
-    """Whether a value is a transform of Dr.Jit floats, like ``to_world``."""
-    # Every Dr.Jit array also has .matrix. Scalar transforms (texture to_uv) hold no Dr.Jit array and have no
-    # derivative.
+    """Return whether a value is a transform of Dr.Jit floats, like ``to_world``."""
+    # Dr.Jit arrays also have an attribute ``matrix``. Scalar transforms (``to_uv`` of textures) contain no Dr.Jit array
+    # and have no derivative.
     return not dr.is_array_v(value) and hasattr(value, "matrix") and dr.is_diff_v(value.matrix)
 
 
 def _array(value: T) -> T | mi.Matrix4f:
-    """The Dr.Jit array of a value; for a transform, its matrix."""
+    """Return the Dr.Jit array of a value, which is the matrix of a transform."""
     return value.matrix if is_transform(value) else value
 
 
@@ -197,14 +201,14 @@ def _is_float(value: object) -> bool:
 
 
 def is_empty(value: object) -> bool:
-    """Whether an array has no entries, like the texture coordinates of a mesh without any."""
+    """Return whether an array has no entries, for example the texture coordinates of a mesh that has none."""
     return 0 in dr.shape(_array(value))
 
 
 def require_finite(params: mi.SceneParameters) -> None:
-    """Raise PathreplayError, with key and index, if a parameter holds a NaN or an infinity.
+    """Raise PathreplayError, which names key and index, if a parameter contains NaN or infinite values.
 
-    A plain number may be infinite, as distances can be. The cost is one reduction per array.
+    Plain numbers, for example distances, may be infinite. The cost is one reduction per array.
     """
     counts: dict[str, mi.UInt32] = {}
     for key in params.keys():
@@ -226,10 +230,10 @@ def require_finite(params: mi.SceneParameters) -> None:
 
 
 def get_array(value: SceneValue | float) -> np.ndarray:
-    """A floating-point parameter value as a NumPy array in its own precision; a copy, without derivatives.
+    """Copy the value of a floating-point parameter to a NumPy array of the same precision, without derivatives.
 
-    Shapes: a plain number (1,); ``Float`` (n,); ``Color3f`` and similar types (3,), or (3, n) for n colours;
-    ``TensorXf`` its own shape; ``AffineTransform4f`` (4, 4).
+    The shape is (1,) for a plain number, (n,) for ``Float``, (3,) or (3, n) for one or n values of ``Color3f`` and
+    similar types, the shape of the tensor for ``TensorXf``, and (4, 4) for ``AffineTransform4f``.
     """
     if isinstance(value, float):
         return np.array([value], np.float32)
@@ -240,7 +244,7 @@ def get_array(value: SceneValue | float) -> np.ndarray:
 
 
 def to_value(like: SceneValue | float, array: ArrayLike) -> Any:
-    """The inverse of :func:`get_array`: ``array`` as a value of the type of ``like``.
+    """Convert ``array`` to a value of the type of ``like``; the inverse of `get_array`.
 
     Raises PathreplayError if the shapes differ.
     """
@@ -257,10 +261,10 @@ def to_value(like: SceneValue | float, array: ArrayLike) -> Any:
 
 
 def displaced(value: SceneValue, direction: np.ndarray, t: mi.Float) -> SceneValue:
-    """``value + t * direction`` for a differentiable scalar ``t`` (``mi.Float`` of size 1), in the type of ``value``.
+    """Compute ``value + t * direction`` for a differentiable scalar ``t`` (``mi.Float`` of size 1).
 
-    ``direction`` has the shape of ``get_array(value)``. For transforms the matrices are added, so that ``direction``
-    need not be invertible. Derivatives propagate from ``t``.
+    ``direction`` has the shape of ``get_array(value)``, and the result has the type of ``value``. For transforms, the
+    matrices are added, so that ``direction`` need not be invertible. Derivatives propagate from ``t``.
     """
     if is_transform(value):
         return type(value)(value.matrix + to_value(value.matrix, direction) * t)

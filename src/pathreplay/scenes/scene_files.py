@@ -1,6 +1,6 @@
-"""Checks of scene files before they reach a library that crashes on their content.
+"""Check scene files, and files to which they refer, for content on which Mitsuba or its libraries would crash.
 
-Errors that Mitsuba itself reports (OBJ indices, truncated meshes, unknown formats) are left to Mitsuba.
+Errors that Mitsuba itself reports, such as wrong OBJ indices, truncated meshes or unknown formats, are not checked.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from pathreplay.scenes.mesh_files import require_sound_ply, require_sound_serial
 from pathreplay.scenes.volume_files import require_whole_vol
 
 DEEPEST = 64
-"""Largest depth of nested elements in a scene file. Real files have ten; Mitsuba's parser overflows its stack at about
-10 000."""
+"""Largest depth of nested elements in a scene file. Real files have a depth of about ten. Mitsuba's parser overflows
+its stack at about 10 000."""
 
 LONGEST = 2**28
-"""Largest size of a scene file in bytes. Mitsuba takes about ten times as much memory to read one."""
+"""Largest size of a scene file in bytes. Mitsuba needs about ten times this amount of memory to read the file."""
 
 
 def require_shallow(path: Path) -> None:
-    """Raise PathreplayError if a scene file, or one that it includes, is too long or nested too deeply."""
+    """Raise PathreplayError if a scene file, or a file that it includes, is too long or nested too deeply."""
     waiting, seen = [path], set()
     while waiting:
         file = waiting.pop()
@@ -63,10 +63,10 @@ def _included(path: Path) -> list[str]:
 
 
 def require_sound_files(state: mi.parser.ParserState) -> None:
-    """Raise PathreplayError if a parsed scene (`mi.parser`) refers to a file that is unsafe to give to Mitsuba.
+    """Raise PathreplayError if a parsed scene (`mi.parser`) would block or crash Mitsuba.
 
-    Checked are pipes and devices, on which Mitsuba would block, the indices of PLY and serialized meshes, the sizes of
-    volumes and images, and groups without a shape.
+    The function detects pipes and devices, on which Mitsuba would block, and shape groups without a shape. It also
+    checks the indices of PLY and serialized meshes, and the sizes of volumes and images.
     """
     for node in state.nodes:
         kind, name = node.props.plugin_name(), node.props.get("filename")
@@ -85,13 +85,13 @@ def require_sound_files(state: mi.parser.ParserState) -> None:
         elif kind == "gridvolume":
             require_whole_vol(path)
         elif kind in ("bitmap", "envmap"):
-            require_readable_picture(path, pixels=2**31)  # only memory limits its size
+            require_readable_picture(path, pixels=2**31)  # in practice, memory limits the size
         elif kind == "serialized":
             require_sound_serialized(path, node.props.get("shape_index", 0))
 
 
 def _require_shapes(state: mi.parser.ParserState, group: mi.parser.SceneNode) -> None:
-    """Raise PathreplayError for an empty shape group; Dr.Jit crashes on its instances."""
+    """Raise PathreplayError for an empty shape group, because Dr.Jit crashes on instances of the group."""
     by_id = {node.props.id(): node for node in state.nodes}
     for key in group.props.keys():
         child, kind = group.props.get(key), group.props.type(key)

@@ -1,9 +1,9 @@
-"""A scene as a pure function of some of its parameters: images, and vector-Jacobian products with image gradients.
+"""A scene as a pure function of some of its parameters, with images and vector-Jacobian products.
 
-The result depends on values, view and seed only. The scene holds the values of the previous call, and nothing depends
-on these: images of several views may be summed before a gradient is computed, because the gradient sets the values of
-its call again. (With `drjit.wrap` around `mi.render`, the gradients of all calls would be taken at the values of the
-last one.)
+The results depend only on parameter values, view and seed. Between calls, the scene contains the values of the previous
+call, but every call sets all values again. A caller may therefore render several views with different values before it
+computes a gradient. (With `drjit.wrap` around `mi.render`, the gradients of all calls would be computed at the values
+of the last call.)
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ class View(NamedTuple):
 
 
 class SceneFunction:
-    """Rendering as a pure function of Dr.Jit tensors, in the order of ``keys``; PyTorch and JAX functions build on it.
+    """Rendering as a pure function of Dr.Jit tensors, one per key; the basis of the PyTorch and JAX functions.
 
     Args:
-        scene: a scene, or the path of an XML file or the name of a built-in scene, with its ``arguments``.
-        keys: parameters by key or glob, from `mi.traverse(scene)`.
+        scene: a scene, the path of an XML file, or the name of a built-in scene.
+        keys: parameters as keys or globs, see `mi.traverse(scene)`.
         integrator: the integrator as a Mitsuba dictionary; `pathreplay` by default.
         spp: samples per pixel, for the image and for its derivative.
+        arguments: parameters of the XML file or the built-in scene.
 
     Raises PathreplayError if the scene or a parameter does not exist, or a parameter is not differentiable.
     """
@@ -70,9 +71,9 @@ class SceneFunction:
         self._start = {key: get_array(value).copy() for key, value in seen.items()}
 
     def require(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raise PathreplayError if the keys differ from the function's or a parameter cannot have its shape.
+        """Raise PathreplayError unless ``shapes`` has the keys of this function and a valid shape for each parameter.
 
-        Textures and grids may be resized.
+        Textures and grids may have any size, with the original number of channels.
         """
         for key in (*self.keys, *shapes):
             if key not in shapes or key not in self._forms:
@@ -93,7 +94,10 @@ class SceneFunction:
             return image
 
     def gradient(self, values: Sequence[mi.TensorXf], view: View, weights: mi.TensorXf) -> list[mi.TensorXf]:
-        """Gradient of the weighted sum of the image, from separate samples whose seed is derived from the view's."""
+        """Compute the gradient of the sum of image times ``weights``.
+
+        The samples are independent of the samples of `picture`, with a seed derived from the seed of the view.
+        """
         sensor, seed, spp = view
         other = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
         with dr.resume_grad(), errors_as("The gradient cannot be computed"):
@@ -110,12 +114,12 @@ class SceneFunction:
             dr.backward_from(dr.sum(image * weights, axis=None))
             gradients = [dr.grad(value) for value in seen]
             dr.eval(gradients)
-            self._put(values, grad=False)  # releases the AD graph held by the scene
+            self._put(values, grad=False)  # frees the AD graph to which the scene refers
         return gradients
 
     def _put(self, values: Sequence[mi.TensorXf], grad: bool) -> list[mi.TensorXf]:
         """Set the parameters of the scene; return the values, attached if ``grad``."""
-        one = dr.opaque(mi.Float, 1)  # optimisers modify memory in place, so Dr.Jit needs a copy
+        one = dr.opaque(mi.Float, 1)  # the product is a copy: optimisers may modify the original memory in place
         seen = [dr.detach(value) * one for value in values]
         dr.eval(seen)
         if grad:

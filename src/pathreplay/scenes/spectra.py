@@ -1,10 +1,10 @@
-"""Colours in spectral variants: the coefficients that Mitsuba stores, and better-scaled values for steps.
+"""Colours in spectral variants: the coefficients that Mitsuba stores, and better-scaled values for optimisation steps.
 
-There a colour is a smooth spectrum S(p(λ)) with p(λ) = c_0 λ² + c_1 λ + c_2, λ in nm, and S(p) = 1/2 + p / (2 √(1 +
-p²)). Mitsuba stores c_0, c_1 and c_2 (for environment maps and grids also a factor, as fourth channel). A step of 0.01
-in c_0 changes p by thousands, the same step in c_2 by almost nothing. Steps are therefore taken in the values of p or S
-at three wavelengths. The values of p are a constant matrix times c; S, a reflectance, is nearly linear in these values
-for colours of low saturation.
+In spectral variants, a colour is a smooth spectrum S(p(λ)), where p(λ) = c_0 λ² + c_1 λ + c_2, λ is in nm, and S(p) =
+1/2 + p / (2 √(1 + p²)). Mitsuba stores c_0, c_1 and c_2, and for environment maps and grids also a factor, as fourth
+channel. A step of 0.01 in c_0 changes p by thousands, and the same step in c_2 changes p by almost nothing. Optimisers
+therefore take steps in the values of p or S at three wavelengths. The values of p are a constant matrix times c. The
+reflectance S is nearly linear in these values for colours of low saturation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 WAVELENGTHS = (610.0, 545.0, 460.0)
-"""Wavelengths (nm) at which p and S are sampled: a moderate red, green or blue is nearly equal to S there."""
+"""Wavelengths (nm) at which p and S are evaluated. There, S is close to the red, green and blue of moderate colours."""
 
 TO_COEFFICIENTS = np.linalg.inv(np.vander(WAVELENGTHS))
 """Matrix that maps the values of p at `WAVELENGTHS` to c."""
@@ -25,7 +25,10 @@ _COLOURS = ("SRGBReflectanceSpectrum", "D65Spectrum")
 
 
 def coefficient_channels(params: mi.SceneParameters, key: str) -> int:
-    """Number of channels of a parameter that holds coefficients: 3, or 4 with a factor; 0 for all others."""
+    """Return the number of channels of a parameter that contains coefficients: 3, or 4 with a factor.
+
+    Returns 0 for all other parameters.
+    """
     if not mi.is_spectral:
         return 0
     owner, name = params.properties[key][2], key.rsplit(".", 1)[-1]
@@ -41,16 +44,16 @@ def coefficient_channels(params: mi.SceneParameters, key: str) -> int:
 
 
 def coefficients(p: np.ndarray) -> np.ndarray:
-    """Coefficients from the values of p at `WAVELENGTHS` (last axis; a fourth channel is copied)."""
+    """Compute the coefficients from the values of p at `WAVELENGTHS` (last axis); a fourth channel is copied."""
     return np.concatenate([p[..., :3] @ TO_COEFFICIENTS.T, p[..., 3:]], axis=-1)
 
 
 def values_of_p(c: np.ndarray) -> np.ndarray:
-    """The inverse of `coefficients`."""
+    """Compute the values of p at `WAVELENGTHS` from the coefficients; the inverse of `coefficients`."""
     return np.concatenate([c[..., :3] @ np.vander(WAVELENGTHS).T, c[..., 3:]], axis=-1)
 
 
 def spectrum(c: Sequence[mi.Float] | mi.Vector3f, wavelength: float) -> mi.Float:
-    """S at a wavelength (nm), from Dr.Jit coefficients."""
+    """Evaluate S at a wavelength (nm) from Dr.Jit coefficients."""
     p = (c[0] * wavelength + c[1]) * wavelength + c[2]
     return 0.5 + 0.5 * p * dr.rsqrt(1 + dr.square(p))

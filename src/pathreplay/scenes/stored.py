@@ -12,7 +12,7 @@ colours in spectral variants  coefficients of a smooth spectrum S,    S at three
                               some with a factor                      (environment maps, volumes)
 ============================  ======================================  =================================================
 
-Jobs optimise, save and compare decoded values, to which bounds, learning rates and resolutions refer.
+Jobs optimise, save and compare decoded values. Bounds, learning rates and resolutions refer to decoded values.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ from pathreplay.scenes.spectra import TO_COEFFICIENTS, WAVELENGTHS, coefficient_
 
 Array = NDArray[np.float32]
 
-# Distance of S from 0 and 1, where p is infinite.
+# S is clipped to [_MARGIN, 1 - _MARGIN] before p is computed from S, because p is infinite at S = 0 and S = 1.
 _MARGIN = 1e-4
 
 
 class Form:
-    """The form of most parameters: decoded values are the stored ones."""
+    """The form of most parameters, whose decoded values are equal to the stored values. Base class of other forms."""
 
     def see(self, stored: SceneValue) -> SceneValue:
-        """The decoded Dr.Jit value, without derivatives."""
+        """Decode a stored Dr.Jit value, without derivatives."""
         return stored
 
     def store(self, seen: SceneValue) -> SceneValue:
-        """The Dr.Jit value for Mitsuba, differentiable in the decoded value."""
+        """Encode a decoded value for Mitsuba; differentiable in the decoded value."""
         return seen
 
     def of_colours(self, key: str, colours: Array) -> Array:
-        """Decoded values of linear RGB colours (or grey values), in the same shape.
+        """Convert linear RGB colours or grey values to decoded values of the same shape.
 
-        Raises PathreplayError if they cannot be represented.
+        Raises PathreplayError if the colours cannot be represented.
         """
         return colours
 
@@ -70,7 +70,7 @@ class Half(Form):
 
 @dataclass(frozen=True)
 class Sky(Form):
-    """Environment maps: the stored columns are the last, then all, then the first."""
+    """Environment maps. Mitsuba stores the last column, then all columns, then the first column."""
 
     mono: bool
 
@@ -91,7 +91,7 @@ class Sky(Form):
 
 @dataclass(frozen=True)
 class Spectra(Form):
-    """Coefficients of smooth spectra: a colour or a texture, with an optional factor as fourth channel."""
+    """Colours and textures stored as coefficients of smooth spectra, with an optional factor as fourth channel."""
 
     scaled: bool = False
     inner: Form = AS_STORED
@@ -104,7 +104,7 @@ class Spectra(Form):
 
     def store(self, seen: SceneValue) -> SceneValue:
         S = mi.Vector3f(*_entries(seen, 3))
-        # As in Mitsuba, the largest entry is scaled to one half, where spectra are smooth.
+        # As in Mitsuba, the largest entry is scaled to one half, because spectra with moderate values are smooth.
         factor = dr.maximum(2 * dr.max(S), 1e-8) if self.scaled else mi.Float(1)
         x = 2 * dr.clip(S / factor, _MARGIN, 1 - _MARGIN) - 1
         p = x * dr.rsqrt(1 - dr.square(x))
@@ -128,7 +128,7 @@ class Spectra(Form):
 
 
 class EmitterColour(Spectra):
-    """The radiance of an emitter, whose brightness is not part of its coefficients."""
+    """The colour of an emitter's radiance, whose brightness Mitsuba stores separately from the coefficients."""
 
     def of_colours(self, key: str, colours: Array) -> Array:
         raise PathreplayError(
@@ -138,7 +138,7 @@ class EmitterColour(Spectra):
 
 
 def form_of(params: mi.SceneParameters, key: str) -> Form:
-    """The form in which the parameter ``key`` of ``mi.traverse(scene)`` is stored."""
+    """Return the form in which the parameter ``key`` of ``mi.traverse(scene)`` is stored."""
     value, owner = params[key], params.properties[key][2]
     kind, name = str(owner.class_name()), key.rsplit(".", 1)[-1]
     form: Form = Half() if isinstance(value, mi.TensorXf16) else AS_STORED
@@ -150,7 +150,7 @@ def form_of(params: mi.SceneParameters, key: str) -> Form:
 
 
 def _entries(value: SceneValue, channels: int) -> Any:
-    """The channels of a colour or tensor, one flat array each."""
+    """Split a colour or tensor into its channels, one flat array per channel."""
     kind = mi.Vector3f if channels == 3 else mi.Vector4f
     return dr.unravel(kind, value.array) if dr.is_tensor_v(value) else value
 

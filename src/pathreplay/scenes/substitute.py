@@ -1,6 +1,6 @@
-"""Load a scene with some plugins replaced by others that read the same parameters.
+"""Load a scene with some plugins replaced by others that have the same properties.
 
-The plugin `bitmap` gets an additional option where 8-bit textures are to be stored as floating-point numbers.
+8-bit textures can also be stored as floating-point numbers, through an option of the plugin `bitmap`.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ def load_file_with(
     cameras: Cameras | None = None,
     floats: Collection[str] = (),
 ) -> tuple[mi.Scene, list[str]]:
-    """`mi.load_file(path, optimize=False, **parameters)` with plugins replaced, also in included files.
+    """Load a file like `mi.load_file(path, optimize=False, **parameters)`, with some plugins replaced.
 
-    `plugins` maps the type named in the scene to the type to load instead, e.g. {"dielectric": "dielectric_ad"}. The
-    new plugin must be registered; it receives the properties and the id of the old one, so that parameter keys are
-    preserved. ``cameras`` are added to those of the scene. ``floats`` are names of image files (without folders) whose
-    `bitmap` textures are stored as floating-point numbers, whatever the file format.
+    ``plugins`` maps a type in the scene or an included file to the type to load instead, for example {"dielectric":
+    "dielectric_ad"}. The new plugin must be registered. It receives the properties and the id of the replaced plugin,
+    so that parameter keys are preserved. ``cameras`` are added to the sensors of the scene. ``floats`` are names of
+    image files (without folders) whose `bitmap` textures are stored as floating-point numbers, regardless of the file
+    format.
 
     Returns the scene (or object) and one line per replaced plugin, with its id and position in the file. Raises
-    RuntimeError (Mitsuba's) for a file that cannot be read or has a property unknown to the new plugin, and
-    PathreplayError for a file that would crash the process: see `require_shallow` and `require_sound_files`.
+    Mitsuba's RuntimeError if a file cannot be read or has a property unknown to the new plugin. Raises PathreplayError
+    if a file would crash the process (see `require_shallow` and `require_sound_files`).
     """
     path = Path(path)
     parameters = parameters or {}
@@ -55,9 +56,9 @@ def load_dict_with(
     cameras: Cameras | None = None,
     floats: Collection[str] = (),
 ) -> tuple[mi.Scene, list[str]]:
-    """`mi.load_dict(scene, optimize=False)` with plugins replaced; otherwise like `load_file_with`.
+    """Load a dictionary like `mi.load_dict(scene, optimize=False)`, with the arguments of `load_file_with`.
 
-    Objects in the dictionary that are already loaded are left unchanged. Raises PathreplayError for a value of None.
+    Objects in the dictionary that are already loaded are not changed. Raises PathreplayError for a value of None.
     """
     require_values(scene)
     with _parsing() as config:
@@ -65,7 +66,10 @@ def load_dict_with(
 
 
 def exchange(props: mi.Properties, plugins: Mapping[str, str], floats: Collection[str]) -> bool:
-    """Replace the plugin of an object, or set its option, in its properties; return whether the plugin was replaced."""
+    """Replace the plugin in the properties of an object, and return whether the plugin was replaced.
+
+    Also set the option that stores the texels of `bitmap` textures in ``floats`` as floating-point numbers.
+    """
     if (new := plugins.get(props.plugin_name())) is not None:
         props.set_plugin_name(new)
         return True
@@ -76,7 +80,7 @@ def exchange(props: mi.Properties, plugins: Mapping[str, str], floats: Collectio
 
 @contextmanager
 def _parsing() -> Iterator[mi.parser.ParserConfig]:
-    """Parser options; within this block files are found by a separate file resolver."""
+    """Provide options for the parser; within the block, a separate file resolver is active."""
     config = mi.parser.ParserConfig(mi.variant())
     # Merging equal objects would change parameter keys.
     config.merge_equivalent = config.merge_meshes = False

@@ -1,4 +1,4 @@
-"""Check of TGA files before Mitsuba decodes them, because it does not test whether runs end with the image.
+"""Check TGA files before Mitsuba decodes them, because Mitsuba does not test whether runs exceed the image.
 
 The format has no magic number at its beginning. Mitsuba recognises a TGA by the footer of version 2.
 """
@@ -21,14 +21,14 @@ _RUNS = {10: (24, 32), 11: (8,)}
 
 
 def is_tga(file: BinaryIO) -> bool:
-    """Whether a file ends like a TGA. Moves the file position."""
+    """Return whether a file ends with the footer of a TGA. Moves the file position."""
     length = file.seek(0, os.SEEK_END)
     file.seek(max(0, length - len(_END)))
     return file.read() == _END
 
 
 def tga_size(data: bytes) -> tuple[int, int]:
-    """Width and height from the header. Raises struct.error."""
+    """Parse width and height in the header. Raises struct.error for a truncated header."""
     return _HEAD.unpack_from(data)[3:5]
 
 
@@ -42,7 +42,7 @@ def require_sound_tga(path: Path) -> None:
             return
         file.seek(0)
         skipped, colours, kind, width, height, bits = _HEAD.unpack(file.read(_HEAD.size))
-        if colours:  # a palette, which Mitsuba rejects, or the second byte of another format's magic number
+        if colours:  # the file has a palette, which Mitsuba rejects, or is of another format
             return
         if max(width, height) > _MOST:
             raise PathreplayError(
@@ -59,10 +59,11 @@ def require_sound_tga(path: Path) -> None:
 
 
 def _filled(data: bytes, pixels: int, pixel: int) -> int:
-    """Number of pixels in the packets of a file; counting stops once there are ``pixels`` or more.
+    """Count the pixels in the packets of a file, up to the packet with which there are ``pixels`` or more.
 
-    A packet is a byte with the number of its pixels minus one, followed by these pixels of ``pixel`` bytes each, or by
-    a single pixel for all if the highest bit of the byte is set. Truncated packets do not count.
+    The lower seven bits of the first byte of a packet are the number of its pixels minus one. The pixels follow, of
+    ``pixel`` bytes each. If the highest bit of the first byte is set, a single pixel follows, which is repeated.
+    Truncated packets do not count.
     """
     at = filled = 0
     while filled < pixels and at < len(data):

@@ -1,7 +1,7 @@
-"""Volumes in files: Mitsuba's `.vol`, and OpenVDB and NanoVDB through the package tinyvdb (the extra `vdb`).
+"""Read and write volume files: Mitsuba's `.vol`, and OpenVDB and NanoVDB through the package tinyvdb (extra `vdb`).
 
-A grid holds samples at the centres of its voxels, like Mitsuba's `gridvolume`. A sparse grid becomes a dense one over
-the bounding box of its active voxels; inactive voxels inside it take the background value.
+The values of a grid are samples at the centres of its voxels, as in Mitsuba's `gridvolume`. A sparse grid is converted
+to a dense grid over the bounding box of its active voxels. Inactive voxels in this box have the background value.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 UNIT_CUBE: Bounds = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
-# 'VOL', version 3; then encoding (1: float32), size in x, y, z, channels, and the bounding box.
+# 'VOL' and version 3, encoding (1: float32), size in x, y, z, number of channels, and bounding box.
 _VOL_MAGIC = b"VOL\x03"
 _VOL_HEADER = struct.Struct("<4s5i6f")
 _FLOAT32 = 1
 
-# 4 GiB of float32. Above, a wrong bounding box is more likely than a volume that can be rendered.
+# 4 GiB of float32. In a larger grid, the bounding box is probably wrong.
 _MOST_VOXELS = 2**30
-# NanoVDB voxels are read one by one, a million per second: half a minute at most, whatever box a file claims.
+# NanoVDB voxels are read one by one, a million per second. This limit corresponds to half a minute.
 _MOST_ASKED_FOR = 2**25
 
-# Above this extinction, free paths are far shorter than single precision resolves.
+# At a higher extinction, free paths are far shorter than the resolution of single precision.
 _LARGEST = 1e12
 
 
@@ -53,7 +53,7 @@ class Volume:
     """Name of the grid in the file; empty for `.vol`."""
 
     def bounds(self) -> Bounds:
-        """Minimum and maximum corner of the volume in world space."""
+        """Return the minimum and maximum corner of the volume's bounding box in world space."""
         corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ self.to_world.T
         (x, y, z), (X, Y, Z) = corners[:, :3].min(axis=0).tolist(), corners[:, :3].max(axis=0).tolist()
         return (x, y, z), (X, Y, Z)
@@ -95,7 +95,7 @@ def save_vol(path: str | Path, data: np.ndarray, bounds: Bounds = UNIT_CUBE) -> 
 
 
 def vol_bytes(data: np.ndarray, bounds: Bounds = UNIT_CUBE) -> bytes:
-    """The `.vol` file of a grid; ``bounds`` is the box that it fills, used if `use_grid_bbox` is set.
+    """Encode a grid as a `.vol` file; ``bounds`` is the box of the grid, which Mitsuba uses if `use_grid_bbox` is set.
 
     Raises PathreplayError for data that have neither three nor four dimensions, or no voxels.
     """
@@ -110,17 +110,17 @@ def vol_bytes(data: np.ndarray, bounds: Bounds = UNIT_CUBE) -> bytes:
 
 
 def vol_bounds(vol: bytes) -> Bounds:
-    """Return the box that the grid of a `.vol` file fills if `use_grid_bbox` is set."""
+    """Return the box in the header of a `.vol` file, which Mitsuba uses if `use_grid_bbox` is set."""
     x, y, z, X, Y, Z = _VOL_HEADER.unpack_from(vol)[6:]
     return (x, y, z), (X, Y, Z)
 
 
 def grid_volume(path: str | Path, grid: str | None = None, **options: object) -> SceneDict:
-    """A volume file as a `gridvolume` for a scene dictionary, positioned in the world space of the file.
+    """Describe a volume file as a `gridvolume` for a scene dictionary, positioned in the world space of the file.
 
-    ``options`` are properties of the plugin (``filter_type``, ``wrap_mode``, ``raw``); ``to_world`` replaces that of
-    the file. The values have the key ``….data`` and are differentiable; the position is not. Needs an active Mitsuba
-    variant.
+    ``options`` are properties of the plugin, such as ``filter_type``, ``wrap_mode`` and ``raw``. The option
+    ``to_world`` replaces the transform in the file. The values have the key ``….data`` and are differentiable, and the
+    position is not. A Mitsuba variant must be active.
     """
     volume = load_volume(path, grid)
     return {
@@ -148,11 +148,11 @@ def require_whole_vol(path: Path) -> None:
 
 
 _CHANNELS = (1, 3, 6)
-"""Scalars, colours, and the parameters of SGGX phase functions."""
+"""Numbers of channels of scalars, colours, and the parameters of SGGX phase functions."""
 
 
 def _vol_header(path: Path) -> tuple[Any, ...] | None:
-    """Encoding, size and box of a `.vol` file; None for another format or a truncated header."""
+    """Read encoding, size and box of a `.vol` file; return None for another format or a truncated header."""
     with path.open("rb") as file:
         header = file.read(_VOL_HEADER.size)
     whole = len(header) == _VOL_HEADER.size and header.startswith(_VOL_MAGIC)
@@ -181,7 +181,7 @@ def _read_vol(path: Path, grid: str | None) -> Volume:
 
 
 def _scaled(scale: Iterable[float], translation: ArrayLike) -> NDArray[np.float64]:
-    """The 4 x 4 matrix (for column vectors) that scales along the axes, then translates."""
+    """Return the 4 x 4 matrix (for column vectors) that scales along the axes, then translates."""
     matrix = np.diag([*map(float, scale), 1.0])
     matrix[:3, 3] = translation
     return matrix
@@ -207,7 +207,7 @@ def _read_vdb(path: Path, grid: str | None) -> Volume:
 
 
 def _require_all_voxels(where: str, source: Any, read: int) -> None:
-    """Raise PathreplayError for active tiles: tinyvdb 0.9 reads leaves only, and tiles would become background."""
+    """Raise PathreplayError for active tiles, which tinyvdb 0.9 does not read and which would become background."""
     nodes = (source.tree.node(i) for i in range(source.tree.num_nodes))
     tiles = sum(node.active_voxel_count for node in nodes if node.type == "internal")
     active = source.metadata.get("file_voxel_count", read)
@@ -219,7 +219,7 @@ def _require_all_voxels(where: str, source: Any, read: int) -> None:
 
 
 def _index_to_world(transform: SceneDict) -> NDArray[np.float64]:
-    """The index-to-world map as a matrix for column vectors."""
+    """Return the index-to-world map as a matrix for column vectors."""
     if "affine" in transform["type"]:
         return np.array(transform["matrix"]).T  # OpenVDB uses row vectors
     return _scaled(transform["scale"], transform["translation"])
@@ -279,7 +279,7 @@ def _chosen(path: Path, grid: str | None, names: list[str]) -> int:
 
 
 def _size(where: str, low: np.ndarray, high: np.ndarray, most: int = _MOST_VOXELS) -> tuple[int, ...]:
-    """Number of voxels along x, y, z of an index box given by its first and last voxel."""
+    """Return the number of voxels along x, y, z of an index box, given its first and last voxel."""
     shape = tuple(int(n) for n in np.asarray(high, np.int64) - low + 1)
     if min(shape) < 1 or np.prod(shape, dtype=np.float64) > most:
         spans = " x ".join(map(str, shape))
@@ -288,6 +288,9 @@ def _size(where: str, low: np.ndarray, high: np.ndarray, most: int = _MOST_VOXEL
 
 
 def _placed(data: NDArray[np.float32], index_to_world: NDArray[np.float64], low: np.ndarray, name: str) -> Volume:
-    """Volume of ``data`` by index (x, y, z), from index ``low`` on; sample (i, j, k) is the centre of its voxel."""
+    """Create the volume of ``data``, an array with axes x, y, z whose first voxel has the index ``low``.
+
+    An index (i, j, k) denotes the centre of a voxel.
+    """
     box = _scaled(data.shape, low - 0.5)
     return Volume(np.ascontiguousarray(data.transpose(2, 1, 0)[..., None]), index_to_world @ box, name)
