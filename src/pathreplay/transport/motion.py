@@ -63,9 +63,9 @@ def path_moves(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
 def edges_move(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
     """Return whether visibility edges may move: occluders, path vertices or emitters depend on gradients.
 
-    The test is that of `path_moves`, with two differences. Texture coordinates and the tangents computed from them do
-    not count, because a texture occludes nothing. A projector or spot light that rotates counts, because the boundary
-    of its lit region moves although its origin does not.
+    The test is the same as in `path_moves`, with two differences. Texture coordinates and the tangents computed from
+    them do not count, because a texture occludes nothing. A projector or spot light that rotates counts, because the
+    boundary of the lit region moves although the position of the light does not.
     """
     lights = [*trace.traits.projectors, *trace.traits.spots]
     turns = trace.attach != "none" and any(with_gradients(light, "to_world", "cutoff_angle") for light in lights)
@@ -93,8 +93,8 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
 def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
     """Return whether the weight of a continuation on a surface depends on parameters with gradients.
 
-    The paths must not move. ``at`` is the first arrival. The function traces the weight of an arbitrary lobe, as later
-    passes do, and inspects its gradients. Nothing is evaluated.
+    The result is valid only if the paths do not move. ``at`` is the first arrival. The function traces the weight of an
+    arbitrary lobe, as later passes do, and inspects whether this weight has gradients. Nothing is evaluated.
     """
     lobe, valid = at.hit.prim_index, at.hit.is_valid()  # values unknown at trace time
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, valid)

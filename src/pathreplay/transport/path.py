@@ -24,8 +24,8 @@ class PathState:
 
     at: Arrival
     β: mi.Spectrum  # throughput
-    # Throughput in which `sustain` replaces the first zero weight of each channel. It replaces β in the decision
-    # whether a path continues, so that paths with remaining derivatives go on. None if zero weights end paths.
+    # Throughput in which `sustain` replaces the first zero weight of each channel. Paths end according to β_alive and
+    # not to β, so that paths with derivatives continue. None if zero weights end paths.
     β_alive: mi.Spectrum | None
     η: mi.Float  # relative index of refraction since the camera
     depth: mi.UInt32  # number of vertices before this one
@@ -94,9 +94,9 @@ def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spe
     """Return the throughput that keeps a differentiated path alive: the first zero weight per channel is replaced.
 
     A weight of zero can have a nonzero derivative, which multiplies the radiance from the rest of the path. The path
-    therefore continues as if the weight were the largest among the channels, or one if all are zero. A second zero
-    makes all derivatives zero and ends the path. A channel in which null collisions have weight zero ends as well,
-    because this weight comes from the sampling and not from the scene.
+    therefore continues as if the weight were the largest weight among the channels, or one if all are zero. A second
+    weight of zero makes all derivatives zero and ends the path. A channel in which null collisions have weight zero
+    ends as well, because this weight comes from the sampling and not from the scene.
     """
     w = dr.detach(step.w)
     w_max = dr.max(w)
@@ -109,7 +109,7 @@ def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spe
 def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.Bool) -> Arrival:
     """Trace the continuation of a step, taken from ``at``, to the next vertex.
 
-    With media, MIS ignores null boundaries: behind one, the density of the last scattering event remains in effect.
+    MIS ignores null boundaries between media: the density of the last scattering event remains in effect behind them.
     """
     kept, null, ray = step.kept, step.null, step.ray_next
     hit = meet(trace, ray, active)

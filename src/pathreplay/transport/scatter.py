@@ -42,7 +42,7 @@ class Sampled:
     """The continuation sampled at a vertex, and the scattering of light from the emitter sample's direction."""
 
     f: mi.Spectrum  # BSDF or phase function, times cosine on surfaces, for the direction of the emitter sample
-    pdf_light: mi.Float  # density of sampling that direction
+    pdf_light: mi.Float  # density of sampling the direction of the emitter sample
     w: mi.Spectrum  # weight of the continuation
     kept: SampledContinuation
     null: mi.Bool  # the continuation passes through without scattering

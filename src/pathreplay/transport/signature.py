@@ -39,7 +39,7 @@ def _group(tables: Tables, shape: mi.UInt32, triangle: mi.UInt32, met: mi.Bool) 
 
 
 def shape_met(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.ShapePtr:
-    """Return the shape that a ray hit. On an instance this is the shape inside, which ``hit.shape`` does not name."""
+    """Return the shape that a ray hit; on an instance, the shape inside, to which ``hit`` does not refer."""
     if not trace.traits.copies:
         return hit.shape
     return hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & hit.is_valid()).shape
@@ -54,7 +54,8 @@ def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
 def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
     """Return whether the shading normal of a mesh faces away from a ray along ``d``, so that shading is black.
 
-    On other shapes this happens only at the silhouette, through rounding, where the outline is an edge in any case.
+    The result is False on other shapes. Their normals face away only through rounding at the silhouette, where the
+    outline is an edge in any case.
     """
     return si.shape.is_mesh() & (dr.dot(si.sh_frame.n, d) > 0)
 
@@ -84,8 +85,7 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
         )
         straight = on_mesh | square | rim
         n = dr.normalize(dr.select(straight, dr.cross(side, ray.d), si.n - dr.dot(si.n, ray.d) * ray.d))
-        # Zero where no normal exists (a triangle without area, a ray along its normal), so that no NaN hides behind a
-        # mask.
+        # Return zero instead of NaN where no normal exists: on a triangle without area, or for a ray along its normal.
         return dr.select(dr.all(dr.isfinite(n)), n, 0)
 
 

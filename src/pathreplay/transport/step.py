@@ -80,7 +80,7 @@ def choose_step(
 def repeat_step(
     trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool, ctx: mi.BSDFContext | None = None
 ) -> Step:
-    """Evaluate the same step again, differentiable in emission, BSDFs, textures and media.
+    """Evaluate a recorded step again, differentiable in emission, BSDFs, textures and media.
 
     If ``attached``, the step is also differentiable in the incident ray, its density and all geometry. The hit point
     then moves with ray and shape, and the continuation moves as described in `scatter`. Otherwise vertices and

@@ -32,13 +32,13 @@ class TraceConfig:
     """Selects which parts of a path move with the parameters. ``none``: no part. ``delta``: hit points and the
     directions of delta lobes. ``all``: also the sampled directions of the BSDFs in ``traits.attachables``."""
     hide_emitters: bool
-    """Hides directly visible emitters."""
+    """Whether directly visible emitters are hidden."""
     max_depth: int
-    """As in Mitsuba; unbounded depth is 2^32 - 1."""
+    """Largest path depth, counted as in Mitsuba. Unbounded depth is 2^32 - 1."""
     rr_depth: int
-    """As in Mitsuba."""
+    """Depth at which Russian roulette begins, counted as in Mitsuba."""
     skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
-    """The method of Mitsuba's integrators of this name."""
+    """The method ``skip_area_emitters`` of Mitsuba's integrators."""
 
     # Inputs of gradient estimators.
     baseline: Callable[..., mi.Spectrum] | None = None
@@ -73,7 +73,7 @@ class TraceConfig:
 
     @property
     def branch(self) -> bool:
-        """Whether one null collision per path is kept."""
+        """Whether one null collision per path is kept (see `null_branching`)."""
         return self.branching is not None
 
     @property
@@ -116,7 +116,7 @@ class SampledContinuation:
     """The choices of the sampling pass at a vertex. Later passes use the same values and add derivatives."""
 
     d: mi.Vector3f  # sampled direction, world space
-    pdf: mi.Float  # its solid-angle density, or the probability of the delta lobe
+    pdf: mi.Float  # solid-angle density of ``d``, or the probability of the delta lobe
     delta: mi.Bool  # a delta lobe was sampled
     black: mi.Bool  # the weight of the continuation was zero in all channels
     lobe: mi.UInt32  # the BSDF component that was sampled
@@ -140,15 +140,15 @@ class Flight:
     """The flight between two vertices, as sampled."""
 
     event: mi.Bool  # a real collision happened before any surface
-    t: mi.Float  # distance to that collision
-    density: mi.Float  # its probability density p σ̄; 1 without a collision
-    W: mi.Spectrum  # product of the weights of the null collisions before it; 1 in grey media
+    t: mi.Float  # distance to the real collision
+    density: mi.Float  # probability density p σ̄ of the real collision; 1 without one
+    W: mi.Spectrum  # product of the weights of all null collisions on the flight; 1 in grey media
     along: mi.Float  # random offset in [0, 1) of the points at which the transmittance is differentiated
     p: mi.Float = None  # type: ignore[assignment]  # probability that the collision was real (None if no null collisions are kept)
     # None without emissive media:
     E: mi.Spectrum = None  # type: ignore[assignment]  # emission accumulated along the flight
     t_emit: mi.Float = None  # type: ignore[assignment]  # distance of the tentative collision at which emission is differentiated
-    c_emit: mi.Spectrum = None  # type: ignore[assignment]  # weight of the emission at that distance
+    c_emit: mi.Spectrum = None  # type: ignore[assignment]  # weight of the emission at distance t_emit
     # Used by the sampling pass only; None when read from a record:
     σ_s: mi.Spectrum = None  # type: ignore[assignment]  # scattering coefficient at the collision
     null: NullCollision = None  # type: ignore[assignment]  # the null collision that is kept; None if none is kept
@@ -177,7 +177,7 @@ class NullCollision:
 
     t: mi.Float  # distance of the collision along the ray
     ω: mi.Spectrum  # W of the null collisions before it, times c branch_weight(p, c) / σ̄, over m
-    bare: mi.Float  # the same without the factor W
+    bare: mi.Float  # ω without the factor W
     mass: mi.Float  # sum of m over all null collisions of the flight
     number: mi.Float  # number of null collisions of the flight
     pick: mi.Float  # random number for the choice between this flight and earlier flights of the path
@@ -189,7 +189,7 @@ class Shadow:
 
     T: mi.Spectrum  # estimate of the transmittance, 0 if occluded
     y: mi.Float  # distance of the point at which the transmittance is differentiated
-    medium: mi.MediumPtr  # the medium at y; null if the ray crosses none
+    medium: mi.MediumPtr  # the medium at y; null if the ray crosses no medium
     length: mi.Float  # length of the ray inside media
 
 

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 CHECKERBOARD, BITMAP, ATTRIBUTE = "Checkerboard", "BitmapTextureImpl", "MeshAttribute"
-"""Class names. The name of a bitmap class begins with this and ends with the texel type."""
+"""Class names. BITMAP is the beginning of the class name of a bitmap, which ends with the texel type."""
 PROBES, BESIDE = 64, 1e-3
 """Number of texel borders that are probed, and the distance of the probes from the borders, in texels."""
 WAVELENGTHS = 440.0, 510.0, 580.0, 650.0

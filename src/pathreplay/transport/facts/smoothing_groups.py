@@ -17,7 +17,7 @@ WELD, ULPS = 1e-5, 4
 
 
 def mesh_smoothing_groups(mesh: mi.Mesh) -> np.ndarray:
-    """Return the `smoothing_groups` of a smooth mesh; zeros for a rectangle, whose vertices Mitsuba hides."""
+    """Return the `smoothing_groups` of a smooth mesh; zeros for a rectangle, whose vertices are not accessible."""
     params = mi.traverse(mesh)
     if "faces" not in params:
         return np.zeros(mesh.face_count(), int)

@@ -24,7 +24,7 @@ ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
-# BSDFs without a narrow lobe of their own.
+# BSDFs that have no narrow lobe, except in nested BSDFs.
 DULL = FRAMES | {MASK, "SmoothDiffuse"}
 INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
@@ -62,7 +62,7 @@ class Traits:
     mirrors: tuple[mi.BSDF, ...]  # BSDFs with delta lobes
     lobes: int  # one more than the largest component index of a delta lobe, 0 if there is none
     attachables: tuple[mi.BSDF, ...]  # BSDFs whose smooth lobes may be sampled attached
-    detached_names: tuple[str, ...]  # class names of the other BSDFs with smooth lobes
+    detached_names: tuple[str, ...]  # class names of BSDFs with smooth lobes that are never sampled attached
     area_lights: bool  # some emitter has an outline
     hard_lights: bool  # some emitter casts hard shadows
     projectors: tuple[mi.Emitter, ...]  # projectors: the region that they light has a hard boundary
@@ -221,7 +221,7 @@ def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Mesh]:
 
 
 def _ball(mesh: mi.Mesh) -> np.ndarray:
-    """Return a bounding sphere around the box centre; radius 0 for a rectangle, whose vertices Mitsuba hides."""
+    """Return a bounding sphere around the box centre; radius 0 for a rectangle, whose vertices are not accessible."""
     params = mi.traverse(mesh)
     if "vertex_positions" not in params:
         return np.zeros(4)

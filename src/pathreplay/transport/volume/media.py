@@ -31,8 +31,8 @@ class Media:
     """Facts about the media of a scene on which the trace depends."""
 
     grids: tuple[Grid, ...]  # media with their own free flight and transmittance (`gridmedium`)
-    plain: bool  # there are other media, accessible only through Mitsuba's interface
-    homogeneous: bool  # some of these other media have constant coefficients
+    plain: bool  # there are media other than grids, accessible only through Mitsuba's interface
+    homogeneous: bool  # some medium other than a grid has constant coefficients
     chromatic: bool  # some extinction differs between channels
     emissive: bool  # some medium emits
     passes: bool  # some surface that is not a null boundary may pass light unscattered
@@ -43,9 +43,10 @@ class Media:
 def scene_media(
     media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | None, branches: bool | None = None
 ) -> Media | None:
-    """Inspect the media of a scene; None without media. ``passes`` is a field of `Media`.
+    """Collect the facts about the media of a scene, or return None without media.
 
-    The sensor may be inside a medium. ``branches`` is the result of `wants_branch`, if it is known already.
+    ``passes`` is a field of `Media`. A medium that contains ``sensor`` becomes the field ``around``. ``branches`` is
+    the result of `wants_branch`, if this result is already known.
     """
     if not media:
         return None

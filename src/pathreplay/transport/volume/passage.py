@@ -29,7 +29,7 @@ def skip_null(
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
     passing = active & _is_boundary(here)
     while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond null boundaries"):
-        # Keep the origin on the ray; `spawn_ray` would offset it sideways.
+        # The new origin stays on the ray. `spawn_ray` would move the origin sideways.
         gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
         onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
         here = meet(trace, onward, passing)
