@@ -165,10 +165,11 @@ def tangents(*values: Any) -> list[Any]:
 def backward(target: mi.Float) -> None:
     """Back-propagate from a scalar per path.
 
-    Raises Unreached if the scalar depends on no parameter with gradients; the gradient would silently be zero.
+    Raises Unreached if the scalar depends on no parameter with gradients. Without this error, the gradient would
+    silently be zero.
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):
-            return  # evaluated calls: other paths or vertices may still reach a parameter
+            return  # if calls are evaluated, other paths or vertices may still reach a parameter
         raise Unreached("no parameter with gradients reaches the light paths")
     dr.backward_from(target)

@@ -71,8 +71,8 @@ class BaselineStats:
 
     cells: BaselineCells
     sums: mi.Float  # for each average, Σ weight·L in three channels and Σ weight
-    nulls: mi.Float  # numbers of null collisions, in partial sums that float32 can hold
-    paths: int  # number of paths of these collisions
+    nulls: mi.Float  # numbers of null collisions, in partial sums that are small enough for float32
+    paths: int  # number of paths that contribute to ``nulls``
     passes: frozenset[Hashable]  # keys of the passes
 
     @staticmethod

@@ -48,7 +48,7 @@ def lights_or(other: Driver) -> Driver:
 def emission_only(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into emitted radiance, for paths of any depth.
 
-    The condition is `only_emission_varies`. Each vertex contributes the emission of the hit surface and the emitter
+    Requires `only_emission_varies`. Each vertex contributes the emission of the hit surface and the emitter
     sample, with the same weights as in the image. A path that leaves the scene also contributes the background. Returns
     False, because paths do not move. Not differentiated: everything except emitted radiance. Raises PathreplayError if
     the paths depend on no parameter with gradients.

@@ -42,7 +42,7 @@ class Branch:
         return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, mi.Float(0), mi.Float(0), mi.UInt32(0), mi.Float(1))
 
     def offer(self, path: PathState, step: SampledStep) -> Branch:
-        """Add the null collision of a flight to the reservoir: it replaces this collision with probability ~ mass."""
+        """Add a flight's null collision to the reservoir; its selection probability is proportional to its mass."""
         ray, null = path.at.ray, step.kept.media.flight.null
         active = path.active & dr.any(path.β != 0)
         mass = self.mass + dr.select(active, null.mass, 0)

@@ -45,14 +45,14 @@ class Recovery:
         return dr.float64_array_t(kind)  # type: ignore[no-any-return]
 
     def regularised(self, A: mi.Matrix4f, sign: mi.Float, smooth: mi.Bool) -> mi.Matrix4f:
-        """Return A + ε X; ``smooth`` selects the lanes in which a smooth lobe was sampled."""
+        """Return A + ε X. Subclasses may also use ``smooth``, the lanes in which a smooth lobe was sampled."""
         ε = dr.select(independence(A) >= ILL_CONDITIONED, 0, type(A[0, 0])(self.noise * sign))
         return A + type(A)(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, ε, 0, 0, 0, 0, ε)
 
 
 @dataclass
 class RayFrame:
-    """Two axes s, t perpendicular to a ray. Rays near it have coordinates (s·o/ℓ, t·o/ℓ, s·d, t·d) relative to it."""
+    """Two axes s, t perpendicular to a ray. A nearby ray (o, d) has the coordinates (s·o/ℓ, t·o/ℓ, s·d, t·d)."""
 
     s: mi.Vector3f
     t: mi.Vector3f

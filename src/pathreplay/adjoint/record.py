@@ -160,7 +160,7 @@ LOBE_SHIFT = 16
 
 
 def _require_known(place: str, remembered: str) -> None:
-    """Raise TypeError if `VertexRecord` has no such field, or `Layout` has no such property."""
+    """Raise TypeError unless ``place`` is a field of `VertexRecord` and ``remembered`` a property of `Layout`."""
     kind: Any = VertexRecord
     for name in place.split("."):
         types = {each.name: str(each.type).split(" ")[0] for each in fields(kind)}

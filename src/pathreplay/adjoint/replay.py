@@ -36,10 +36,10 @@ def replay(
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start``.
 
-    Returns whether the path moves with the parameters. If it does, ray adjoints are recovered according to
-    ``recovery``, ``lost`` counts the paths with a non-finite ray adjoint, and a warning reports smooth lobes once. Not
-    differentiated: visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and, with
-    ``attach='none'``, all motion.
+    Returns whether the path moves with the parameters. If the path moves, ``recovery`` describes how ray adjoints are
+    recovered, and ``lost`` counts the paths with a non-finite ray adjoint. Smooth lobes then cause one warning. Not
+    differentiated: visibility, weights that are exactly zero (in contrast to the sweep driver) and, with
+    ``attach='none'``, all motion. Raises PathreplayError if a path moves in a scene with media.
     """
     # With null branching, paths continue as in the other drivers, so that the branch gets the same samples.
     path = PathState.begin(trace, start, sustained=trace.branch)

@@ -1,7 +1,6 @@
 """Attached path replay: also recover the adjoint of the ray, by inverting one 4x4 Jacobian per vertex.
 
-The first pass stores L_0 and q_0 = δL·∂L_0/∂r_0. At each vertex, the second pass computes radiance and ray adjoint of
-the next ray from those of the incident ray ("peeling"):
+The first pass stores L_0 and q_0 = δL·∂L_0/∂r_0. The second pass ("peeling") computes L and q of each next ray:
 
     β_{i+1} L_{i+1} = β_i L_i - β_i e_i,      (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i,      A_i = ∂r_{i+1}/∂r_i,
 
@@ -37,9 +36,8 @@ def replay_attached(
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start`` of a ``path``.
 
     ``lost`` counts the paths on which some q was not finite and was dropped. The recovery is exact on chains of delta
-    lobes. At smooth lobes, A_i has rank two. Without noise, q cannot be recovered there. With noise, the result is
-    unbiased, as long as amplified rounding errors do not exceed it. Not differentiated: visibility, and weights that
-    are exactly zero.
+    lobes. At smooth lobes A_i has rank two. There, q cannot be recovered without noise, and is unbiased with noise,
+    unless amplified rounding errors exceed it. Not differentiated: visibility, and weights that are exactly zero.
     """
     scale = length_scale(trace.scene)
     again = start.sampler.clone()

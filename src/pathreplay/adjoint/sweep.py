@@ -27,9 +27,9 @@ def sweep(
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start``.
 
-    Returns whether the path moves with the parameters. ``lost`` counts two kinds of paths. In media, these are paths
-    that were truncated because null boundaries filled the record (see `room_for`). If paths move, these are also paths
-    with a ray adjoint that was not finite and was set to zero. ``seen`` collects radiance in media for the baseline of
+    Returns whether the path moves with the parameters. ``lost`` counts the paths that lost a part of their gradient,
+    for one of two reasons. In media, a path is truncated if null boundaries fill its record (see `room_for`). On a path
+    that moves, a ray adjoint that is not finite is set to zero. ``seen`` collects radiance in media for the baseline of
     later passes. Weights that are exactly zero are differentiated. Not differentiated: visibility and, with
     ``attach='none'``, all motion.
 
