@@ -50,7 +50,7 @@ def _index(props: mi.Properties, name: str, default: str) -> float:
 class DielectricAD:
     """A smooth dielectric whose index of refraction is differentiable; a template, see `on_base`."""
 
-    specular_reflectance: mi.Texture | None  # None means 1, at no cost
+    specular_reflectance: mi.Texture | None  # None stands for 1, and nothing is evaluated
     specular_transmittance: mi.Texture | None
 
     def __init__(self, props: mi.Properties) -> None:

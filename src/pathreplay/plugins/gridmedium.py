@@ -200,7 +200,7 @@ def _choice(props: mi.Properties) -> bool | str:
 
 
 def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
-    """Return whether the volume differs between channels, and its bounds per cell, from finest to a single cell."""
+    """Return whether channels of the volume differ, and its bounds per cell, from the finest level to a single cell."""
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]
     if volume.class_name() == "GridVolume":

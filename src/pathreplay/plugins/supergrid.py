@@ -63,7 +63,7 @@ class Bounds:
 
     @property
     def faces_per_length(self) -> float:
-        """Cell faces crossed per unit length by a ray of random direction (the mean of |d_k| is 1/2)."""
+        """Mean number of cell faces that a ray of random direction crosses per unit length (|d_k| has mean 1/2)."""
         return float(np.linalg.norm(self.to_cell[:, :3], axis=1).sum() / 2)
 
     @property
@@ -99,7 +99,8 @@ def find_lattice(volume: mi.Volume, shape: tuple[int, ...]) -> Lattice | None:
     to_voxel = np.concatenate([to_local, -(to_local @ corner)[:, None]], axis=1) * np.array(size)[:, None]
     corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1)
     reached = to_voxel[:, :3] @ corners + to_voxel[:, 3:]
-    # A hundredth of a voxel is rounding error; the bounds hold for half a voxel beyond the range.
+    # Differences of a hundredth of a voxel are rounding errors. They are harmless, because the bounds are valid up to
+    # half a voxel beyond the range.
     first = np.floor(reached.min(axis=1) + 0.01).astype(int)
     last = np.ceil(reached.max(axis=1) - 0.01).astype(int)
     return Lattice(to_voxel, size, tuple(first.tolist()), tuple(np.maximum(last, first + 1).tolist()))

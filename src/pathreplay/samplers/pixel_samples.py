@@ -16,7 +16,7 @@ of a path depends on fewer independent paths. With more sets, the samples of a s
 
 
 class PixelSamples(Protocol):
-    """Samples of all paths of each lane's pixel."""
+    """Samplers for all paths of a pixel; each lane samples one pixel."""
 
     def together(self, paths: int) -> int:
         """Return the number of paths per set, for ``paths`` paths in total."""
@@ -33,7 +33,7 @@ class PixelSamples(Protocol):
 
 @dataclass(frozen=True)
 class IndependentSets:
-    """Samples of a sampler with independent samples: each path is its own set."""
+    """Samples from a sampler of Mitsuba with independent samples, so that each path is a separate set."""
 
     sampler: mi.Sampler
 

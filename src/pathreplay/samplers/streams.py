@@ -49,5 +49,5 @@ class Stream(IntEnum):
     SECOND_IMAGE = 0x2B5AD2C7  # a second, independent image of one view
 
     def of(self, seed: mi.UInt32) -> mi.UInt32:
-        """Derive the seed or key of this stream from a shared one."""
+        """Derive the seed or key of this stream from a shared seed or key."""
         return seed ^ int(self)

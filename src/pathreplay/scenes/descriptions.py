@@ -59,7 +59,7 @@ def errors_as(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -
 def one_line(error: BaseException) -> str:
     """Convert a Mitsuba or Dr.Jit error to one readable line, without C++ source positions and Python tracebacks."""
     text = str(error)
-    if "PathreplayError: " in text:  # raised by one of our plugins: already a message for users
+    if "PathreplayError: " in text:  # one of our plugins raised the error, and its message is written for users
         return " ".join(text.rsplit("PathreplayError: ", 1)[1].split())
     text = re.sub(r"Traceback \(most recent call last\):\n(?:[ ]+.*\n)*", "", text)
     text = re.sub(r"\[[A-Za-z_]+\.cpp:\d+\] ", "", text)

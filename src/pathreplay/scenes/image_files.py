@@ -83,7 +83,7 @@ def radiance_head(data: bytes) -> RadianceHead:
     exposure, xyz = 1.0, False
     for line in text.decode("latin-1").split("\n")[1:]:
         name, _, value = line.partition("=")
-        if name == "EXPOSURE":  # several factors are multiplied
+        if name == "EXPOSURE":  # the factors of several EXPOSURE lines are multiplied
             exposure *= float(value)
         elif name == "FORMAT":
             xyz = value.strip() == "32-bit_rle_xyze"

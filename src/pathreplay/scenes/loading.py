@@ -98,7 +98,7 @@ def load_scene_for(
     /,
     **parameters: object,
 ) -> tuple[mi.Scene, tuple[str, ...]]:
-    """Load a scene in which ``wanted`` keys and globs are differentiable, replacing plugins where that is necessary.
+    """Load a scene in which ``wanted`` keys and globs are differentiable, replacing plugins where necessary.
 
     If a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded again with
     `dielectric_ad` in place of every ``dielectric``. If a pattern that ends in ``data`` matches an 8-bit texture, the

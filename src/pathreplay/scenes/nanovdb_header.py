@@ -1,4 +1,4 @@
-"""Validate the headers of a NanoVDB file, because the reader crashes on a damaged one.
+"""Validate the headers of a NanoVDB file, because the reader crashes on damaged headers.
 
 A file is a sequence of segments. A segment consists of a header of 16 bytes (magic, version, number of grids,
 compression), a description of every grid (176 bytes and a name), and the grids. A grid begins with a header of 672

@@ -15,7 +15,7 @@ from pathreplay.errors import PathreplayError
 _HEAD = struct.Struct("<BBB9xHHBx")
 _END = b"TRUEVISION-XFILE.\0"
 _MOST = 2**15 - 1
-"""Largest width and height in pixels. Mitsuba reads them as signed numbers."""
+"""Largest width and height in pixels. Mitsuba reads width and height as signed numbers."""
 _RUNS = {10: (24, 32), 11: (8,)}
 """Run-length encoded image types, colour and grey, and their possible bits per pixel."""
 

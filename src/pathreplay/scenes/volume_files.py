@@ -235,7 +235,7 @@ def _read_nvdb(path: Path, grid: str | None) -> Volume:
         where = f"Grid '{file.grid_name(index)}' of {path}"
         if file.grid_type(index) != "Float":
             raise PathreplayError(f"{where} is of type {file.grid_type(index)}; only grids of Float can be read")
-        # tinyvdb 0.9 returned wrong values in all but the first grid of such files.
+        # In uncompressed files, tinyvdb 0.9 returns wrong values for all grids except the first.
         if index > 0 and not packed:
             raise PathreplayError(
                 f"{where} is uncompressed and not the first of its file, which cannot be read; save it with zip"
