@@ -1,8 +1,8 @@
 """Cell-by-cell ray traversal: free flight with local majorants, transmittance with local control densities.
 
 The state of the traversal (Amanatides and Woo 1987) is the cell and the distance. The distance to the next cell face of
-axis k is recomputed from the cell, as t_k = (cell_k + [d_k > 0] - o_k) / d_k, and not accumulated. Rounding errors
-therefore do not grow. Every step leaves a cell and never returns to it, which bounds the number of steps.
+axis k is computed from the cell, as t_k = (cell_k + [d_k > 0] - o_k) / d_k. It is not accumulated, so that rounding
+errors do not grow. Every step leaves a cell and never returns to it, which bounds the number of steps.
 
 Callers detach all inputs, except those of `through`. All functions can be used inside symbolic loops.
 """
@@ -195,8 +195,9 @@ def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Compute control density c and residual collision rate m per cell, for the density ``scale`` times the volume.
 
     The relative variance of the estimate is exp(∫ (σ - c)²/m ds) - 1. On average, the mean density is the best control.
-    However, a ray may pass through a part of the cell where σ is the lowest density of the cell, and there (σ - c)²/m
-    is large. c is therefore limited, such that the integral over this part does not exceed RISK for one cell.
+    However, σ may be the lowest density of the cell along the whole ray, and (σ - c)²/m is then large in a dense cell.
+    The difference of c from the lowest density is therefore limited, so that the integral over one cell stays below
+    RISK.
     """
     lowest, highest = _scaled(bounds, scale)
     length = 2 / bounds.faces_per_length  # twice the mean length of a ray in a cell

@@ -4,7 +4,7 @@
 return. `coarser` merges 2 x 2 x 2 cells. `cheapest` selects a cell size between BASE³ voxels and the whole volume.
 
 `gridvolume` does not expose its filter and its wrap mode. The bounds are therefore valid for both filters and all wrap
-modes: a cell includes adjacent voxels and, beyond the faces of the grid, the values of every wrap mode. The bounds are
+modes. A cell includes adjacent voxels and, beyond the faces of the grid, the values of every wrap mode. The bounds are
 also valid up to half a voxel beyond the faces of the cell, so that rounding in a traversal is harmless.
 
 Nothing here is differentiated.

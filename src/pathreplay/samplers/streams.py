@@ -1,9 +1,9 @@
 """Streams: named, disjoint sequences of the counter-based samplers, one per purpose.
 
-The value of a stream is used in one of four ways: as the first index of the stream in a key (`CounterSampler.stream`),
-combined with a seed or key by exclusive or, added to the state of a generator, or hashed into the key of a Sobol
-sampler. The indices from 0 on of a key belong to the path itself, with six samples per vertex (see
-`CounterSampler.at_vertex`).
+There are four kinds of streams. The value of a stream is the first index of the stream in a key
+(`CounterSampler.stream`), is combined with a seed or key by exclusive or, is added to the state of a generator, or is
+hashed into the key of a Sobol sampler. The lowest indices of a key, from 0 on, belong to the path itself, with six
+samples per vertex (see `CounterSampler.at_vertex`).
 """
 
 from __future__ import annotations

@@ -232,8 +232,8 @@ def require_finite(params: mi.SceneParameters) -> None:
 def get_array(value: SceneValue | float) -> np.ndarray:
     """Copy the value of a floating-point parameter to a NumPy array of the same precision, without derivatives.
 
-    The shape is (1,) for a plain number, (n,) for ``Float``, (3,) or (3, n) for one or n values of ``Color3f`` and
-    similar types, the shape of the tensor for ``TensorXf``, and (4, 4) for ``AffineTransform4f``.
+    The shape is (1,) for a plain number, (n,) for ``Float``, and (4, 4) for ``AffineTransform4f``. A single ``Color3f``
+    has the shape (3,), and n colours have the shape (3, n). A ``TensorXf`` has its own shape.
     """
     if isinstance(value, float):
         return np.array([value], np.float32)

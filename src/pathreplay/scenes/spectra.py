@@ -1,10 +1,10 @@
 """Colours in spectral variants: the coefficients that Mitsuba stores, and better-scaled values for optimisation steps.
 
-In spectral variants, a colour is a smooth spectrum S(p(λ)), where p(λ) = c_0 λ² + c_1 λ + c_2, λ is in nm, and S(p) =
-1/2 + p / (2 √(1 + p²)). Mitsuba stores c_0, c_1 and c_2, and for environment maps and grids also a factor, as fourth
-channel. A step of 0.01 in c_0 changes p by thousands, and the same step in c_2 changes p by almost nothing. Optimisers
-therefore take steps in the values of p or S at three wavelengths. The values of p are a constant matrix times c. The
-reflectance S is nearly linear in these values for colours of low saturation.
+In spectral variants, a colour is a smooth spectrum S(p(λ)), with S(p) = 1/2 + p / (2 √(1 + p²)), p(λ) = c_0 λ² + c_1 λ
++ c_2, and λ in nm. Mitsuba stores c_0, c_1 and c_2. For environment maps and grids, the fourth channel is a factor. A
+step of 0.01 in c_0 changes p by thousands, and the same step in c_2 changes p by almost nothing. Optimisers therefore
+take steps in the values of p or S at three wavelengths. The values of p are a constant matrix times c. The reflectance
+S is nearly linear in the values of p for colours of low saturation.
 """
 
 from __future__ import annotations

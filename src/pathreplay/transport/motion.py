@@ -22,9 +22,9 @@ COPIES = frozenset({"Instance", "ShapeGroup"})
 def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Shape, ...] | None:
     """Find the shapes that have gradients themselves or in a child object, such as a BSDF.
 
-    Returns None, which means that everything may move, if an object outside the shapes has gradients, if an instance or
-    shape group has gradients, or if more than `FEW` shapes have gradients. The caller knows that the objects in
-    ``still`` do not move; their gradients are ignored.
+    Returns None, which means that everything may move, if gradients exist outside the shapes, in an instance or shape
+    group, or in more than `FEW` shapes. The caller knows that the objects in ``still`` do not move. The gradients of
+    these objects are ignored.
     """
     params = mi.traverse(scene)
     with dr.resume_grad():

@@ -1,10 +1,10 @@
 """Scatter: sample the continuation of a path at a surface or in a medium, and differentiate its weight and direction.
 
 The sampling pass chooses a lobe, and later passes keep this choice. Smooth lobes use detached sampling: the weight f/p
-is differentiated with constant p, and the direction either follows the next hit point, which is fixed on its surface,
-or is constant (see `velocity`). Delta lobes use attached sampling: the derivative passes through the sampled direction.
-With ``attach='all'``, the smooth lobes of attachable BSDFs are sampled attached as well. With ``attach='delta'``, this
-applies only to narrow lobes, and only in scenes without outlines.
+is differentiated with constant p. Their direction is constant, or follows the next hit point, which is fixed on its
+surface (see `velocity`). Delta lobes use attached sampling: the derivative passes through the sampled direction. With
+``attach='all'``, the smooth lobes of attachable BSDFs are sampled attached as well. With ``attach='delta'``, only
+narrow lobes are, and only in scenes without outlines.
 """
 
 from __future__ import annotations

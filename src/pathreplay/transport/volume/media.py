@@ -125,9 +125,9 @@ def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) 
 def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Attach a distance to the moving ends of the interval [a, b]; return it with the interval's stretch factor.
 
-    The returned values are ``t`` and 1. Their derivatives are those of a + x (b - a) and (b - a) / (b₀ - a₀), where x
-    is the constant relative position of ``t`` in the interval, and a₀ and b₀ are the detached ends. Where ``where`` is
-    false or b is infinite, both derivatives are zero.
+    The returned values are ``t`` and 1, with the derivatives of a + x (b - a) and (b - a) / (b₀ - a₀). Here x is the
+    constant relative position of ``t`` in the interval, and a₀ and b₀ are the detached ends. Where ``where`` is false
+    or b is infinite, both derivatives are zero.
     """
     a0, b0 = dr.detach(a), dr.detach(b)
     held = where & dr.isfinite(b0) & (a0 < b0)
