@@ -165,8 +165,7 @@ def tangents(*values: Any) -> list[Any]:
 def backward(target: mi.Float) -> None:
     """Back-propagate from a scalar per path.
 
-    Raises Unreached if the scalar depends on no parameter with gradients. Without this error, the gradient would
-    silently be zero.
+    Raises Unreached if the scalar depends on no parameter with gradients, instead of a gradient that is silently zero.
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):

@@ -15,8 +15,7 @@ class Driver(Protocol):
     """Back-propagates the adjoint radiance ``δL`` of each path into the parameters and into the ``start``.
 
     Returns whether the paths move with the parameters. ``lost`` counts paths that lost a part of their gradient. The
-    caller suspends gradients (`dr.suspend_grad`). The docstring of each driver lists what the driver does not
-    differentiate.
+    caller suspends gradients (`dr.suspend_grad`). Each driver documents what it does not differentiate.
     """
 
     def __call__(self, trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool: ...
@@ -25,8 +24,7 @@ class Driver(Protocol):
 class ForwardDriver(Protocol):
     """Computes the tangent of the radiance from the tangents of the parameters.
 
-    Returns the tangent and Mitsuba's alpha, both per path, and whether the paths move with the parameters. For ``lost``
-    see `Driver`.
+    Returns the tangent and Mitsuba's alpha per path, and whether paths move. ``lost`` is as in `Driver`.
     """
 
     def __call__(

@@ -29,8 +29,7 @@ def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool
 def walk_on(trace: TraceConfig, sampler: Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
     """Continue a path from its present state; return the radiance along the path, and ``valid`` (see `primal`).
 
-    The throughput ``path.β`` should be one, because it is a factor of the result. The background does not make a path
-    valid.
+    The throughput ``path.β`` must be one, because it is a factor of the result. The background makes no path valid.
     """
     trace = replace(trace, background_apart=trace.media is None)
     L = mi.Spectrum(0)  # radiance so far

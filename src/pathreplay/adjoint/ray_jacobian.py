@@ -116,10 +116,7 @@ def length_scale(scene: mi.Scene) -> float:
 
 
 def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
-    """Differentiate weight·e with respect to the density of an arrival and to the motion of its origin along the ray.
-
-    ``weight`` is detached.
-    """
+    """Differentiate weight·e (detached weight) with respect to density, and motion of the origin along the ray."""
     if not has_smooth_lobes(trace):
         return Slope(mi.Float(0), mi.Float(0))
     slopes = []

@@ -52,10 +52,7 @@ def deepest(trace: TraceConfig, device: Device | None = None) -> int:
 
 
 def largest_record(trace: TraceConfig) -> int:
-    """Return the size in bytes of a record, for static or moving paths, whichever is larger.
-
-    Static paths record radiance, and moving paths record random numbers.
-    """
+    """Return the size in bytes of the larger record: static paths record radiance, moving paths random numbers."""
     return max(_bytes(Layout.of(trace, moves)) for moves in (False, True))
 
 
@@ -65,10 +62,7 @@ def _bytes(layout: Layout) -> int:
 
 
 def room_for(trace: TraceConfig) -> int:
-    """Return the number of records per path: one per vertex, and with media also two null boundaries per vertex.
-
-    Two null boundaries per vertex suffice for convex media.
-    """
+    """Return the number of records per path. With media, two null boundaries per vertex (convex media) are added."""
     if trace.media is None:
         return device_of(mi.variant()).room(max(trace.max_depth, 1))
     return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)

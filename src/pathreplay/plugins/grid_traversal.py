@@ -195,9 +195,8 @@ def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Compute control density c and residual collision rate m per cell, for the density ``scale`` times the volume.
 
     The relative variance of the estimate is exp(∫ (σ - c)²/m ds) - 1. On average, the mean density is the best control.
-    However, σ may be the lowest density of the cell along the whole ray, and (σ - c)²/m is then large in a dense cell.
-    The difference of c from the lowest density is therefore limited, so that the integral over one cell stays below
-    RISK.
+    However, a ray may meet only the lowest density of the cell, and (σ - c)²/m is then large in a dense cell. c is
+    therefore limited, so that the integral over such a part of one cell does not exceed RISK.
     """
     lowest, highest = _scaled(bounds, scale)
     length = 2 / bounds.faces_per_length  # twice the mean length of a ray in a cell

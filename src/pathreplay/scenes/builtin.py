@@ -129,10 +129,7 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
 
 
 def _bumps(size: int) -> np.ndarray:
-    """Return the normal map of the height h(x, y) = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), with w = (1 - x²)²(1 - y²)².
-
-    The height is flat at the border.
-    """
+    """Return the normal map of h = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), where w = (1 - x²)²(1 - y²)² fades it out."""
     y, x = (2 * centres - 1 for centres in _centres(size, size))
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -275,8 +272,7 @@ def _panel(place: mi.ScalarTransform4f, *colour: float) -> SceneDict:
 def flat_colours(resolution: int = 32) -> SceneDict:
     """Describe emissive panels of one colour each, at different distances before a black background.
 
-    Images are piecewise constant, and only their edges move. The camera, with key ``camera.to_world``, looks at the
-    panels from a distance of three units.
+    An image shows nothing but edges. The camera, ``camera.to_world``, looks at the panels from a distance of 3.
     """
 
     def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> mi.ScalarTransform4f:
@@ -340,10 +336,7 @@ def _cumulus(size: int) -> np.ndarray:
 
 
 def _sky(rows: int) -> np.ndarray:
-    """Return a sky that is blue above and dim below, with a sun at an elevation of 50 degrees.
-
-    The sun is blurred over 8 degrees, so that paths hit it.
-    """
+    """Return a sky, blue above and dim below, with a sun at 50 degrees, blurred over 8 degrees so that paths hit it."""
     v, u = _centres(rows, 2 * rows)
     θ, φ = np.pi * v, 2 * np.pi * u
     d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)  # Mitsuba's envmap

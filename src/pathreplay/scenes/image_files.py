@@ -71,10 +71,7 @@ def pixmap_head(data: bytes) -> PixmapHead:
 
 
 def radiance_head(data: bytes) -> RadianceHead:
-    """Parse the header of a Radiance image: text lines, an empty line, and the resolution.
-
-    Raises ValueError for a header that is missing or has invalid values.
-    """
+    """Parse a Radiance header: text lines, an empty line, and the resolution. Raises ValueError for invalid headers."""
     text, gap, rest = data.partition(b"\n\n")
     resolution, end, _ = rest.partition(b"\n")
     match = _RESOLUTION.fullmatch(resolution.decode("latin-1"))
@@ -169,10 +166,7 @@ def _jpeg_size(file: BinaryIO) -> tuple[int, int]:
 
 
 def _exr_size(file: BinaryIO) -> tuple[int, int]:
-    """Parse the size in the data window, an attribute of the first header.
-
-    An attribute consists of its name, its type, the length of its value, and the value.
-    """
+    """Parse the size in the attribute ``dataWindow``; attributes consist of name, type, length of the value, value."""
     file.seek(8)
     for _ in range(_MOST_PARTS):
         name, kind = _text(file), _text(file)

@@ -81,10 +81,7 @@ def _ply_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
 
 
 def _triangles(file: BinaryIO, elements: list[_Element], form: str) -> np.ndarray | None:
-    """Read the vertex indices of the faces, (n, 3).
-
-    Returns None for missing data or non-triangular faces, which Mitsuba rejects.
-    """
+    """Read the vertex indices (n, 3), or return None for missing data or other polygons, which Mitsuba rejects."""
     vertex, face = (element.layout(form) for element in elements[:2])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy warns if text follows the numbers

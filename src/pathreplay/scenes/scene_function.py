@@ -94,10 +94,7 @@ class SceneFunction:
             return image
 
     def gradient(self, values: Sequence[mi.TensorXf], view: View, weights: mi.TensorXf) -> list[mi.TensorXf]:
-        """Compute the gradient of the sum of image times ``weights``.
-
-        The samples are independent of the samples of `picture`, with a seed derived from the seed of the view.
-        """
+        """Compute the gradient of sum(image * weights), from samples that are independent of those of `picture`."""
         sensor, seed, spp = view
         other = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
         with dr.resume_grad(), errors_as("The gradient cannot be computed"):

@@ -66,10 +66,7 @@ def load_dict_with(
 
 
 def exchange(props: mi.Properties, plugins: Mapping[str, str], floats: Collection[str]) -> bool:
-    """Replace the plugin in the properties of an object, and return whether the plugin was replaced.
-
-    Also set the option that stores the texels of `bitmap` textures in ``floats`` as floating-point numbers.
-    """
+    """Replace the plugin of an object, or set the option for ``floats``; return whether the plugin was replaced."""
     if (new := plugins.get(props.plugin_name())) is not None:
         props.set_plugin_name(new)
         return True

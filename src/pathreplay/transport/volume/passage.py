@@ -47,10 +47,7 @@ def _is_boundary(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 def transmittance_up_to(
     trace: TraceConfig, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: Sampler, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
-    """Estimate the transmittance of a ray that starts in ``medium``, up to distance ``reach``. Detached.
-
-    Returns the transmittance and the medium at the end.
-    """
+    """Estimate the transmittance from inside ``medium`` up to ``reach``; also return the medium there. Detached."""
     ray = mi.Ray3f(ray)
     ray.maxt = reach
     stretch = Stretch.begin(ray, medium, active)
