@@ -155,7 +155,7 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
     **_of("parameters.texture", lower=[0.0], upper=[1.0], learning_rate=[0.1]),
     **_of("parameters.texture", initial=[0.3, {"image": "texture.png", "fit": "crop", "raw": True}]),
     **_of("parameters.texture", total_variation=[0.1], l2_to_initial=[0.1], regularizer=["own:penalty"]),
-    **_of("parameters.texture", parameterization=["softplus", "log"]),
+    **_of("parameters.texture", parameterization=["softplus", "log"], pyramid=[True]),
     **_of("parameters.texture", {"parameters.texture.refine_at": [1]}, resolutions=[[2, 4]]),
     **_of("parameters.texture", {"parameters.texture.resolutions": [2, 4]}, refine_at=[[1]]),
     **_of("parameters.mesh", _MESH, large_steps_lambda=[5.0], laplacian_weight=[0.1]),

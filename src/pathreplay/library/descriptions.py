@@ -30,6 +30,7 @@ class Parameter:
         parameterization: ``"log"``, ``"softplus"`` or ``"logit"``: function of the value in which steps are taken.
         resolutions: sizes of a grid, coarse to fine.
         refine_at: iterations at which the grid is refined.
+        pyramid: take steps in the levels of a Laplacian pyramid of a texture or volume.
         pose: motion of a ``to_world`` or of ``vertex_positions``: ``"translation"``, ``"rotation"`` or ``"rigid"``.
         pivot: centre of the rotation of a pose.
         rotation_learning_rate: learning rate of the rotation of a pose, in degrees.
@@ -48,6 +49,7 @@ class Parameter:
     parameterization: str | None = None
     resolutions: Sequence[int] | None = None
     refine_at: Sequence[int] | None = None
+    pyramid: bool | None = None
     pose: str | None = None
     pivot: Sequence[float] | None = None
     rotation_learning_rate: float | None = None

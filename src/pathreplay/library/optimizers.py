@@ -14,6 +14,7 @@ from pathreplay.inverse.loop.loop import optimiser_of
 from pathreplay.inverse.optim.adaptive import Optimiser, State
 from pathreplay.inverse.parameters.pose import PART_NAMES
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.variables import latents
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.scenes.parameters import resolve_keys
 from pathreplay.types import Json
@@ -159,7 +160,7 @@ def adapted(optimizer: Any, problem: Problem, values: Arrays) -> Optimiser:
     if not hasattr(optimizer, "step"):
         return optimiser_of(problem, values, problem.config.optimizer, optimizer)
     if hasattr(optimizer, "set_learning_rate") and hasattr(optimizer, "keys"):
-        return OfMitsuba(optimizer, values, _rated(problem))
+        return OfMitsuba(optimizer, latents(problem.variables, values), _rated(problem))
     return OfUser(optimizer, values)
 
 

@@ -15,6 +15,7 @@ from pathreplay.inverse.objective.evaluate import Executor, Local
 from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.optim import adaptive
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.variables import latents
 from pathreplay.inverse.problem import problem as inner
 from pathreplay.library.optimizers import Stepper, adapted, options_of
 from pathreplay.library.problem import Problem, run_settings
@@ -44,7 +45,7 @@ class _Task:
         """Return an optimiser whose internal state is that of ``state``."""
         if self.optimiser is None or self.at is not state:
             self.optimiser = self.own or optimiser_of(built, state._next, built.config.optimizer)
-            self.optimiser.restore(state._kept, state._next)
+            self.optimiser.restore(state._kept, latents(built.variables, state._next))
         self.at = None  # in sync with no state until the step has succeeded
         return self.optimiser
 

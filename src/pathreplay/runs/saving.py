@@ -118,7 +118,7 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
                 )
             require_finite_array(str(path), image)
     for name, saved in _runs(run).items():
-        checkpoint.restore(folder / name, saved, {v.key: v.levels for v in problem.variables}, held)
+        checkpoint.restore(folder / name, saved, problem.variables, held)
     return before
 
 

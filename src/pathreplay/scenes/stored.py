@@ -39,6 +39,11 @@ _MARGIN = 1e-4
 class Form:
     """The form of most parameters, whose decoded values are equal to the stored values. Base class of other forms."""
 
+    @property
+    def wraps(self) -> bool:
+        """Whether the first and the last column of a texture are neighbours."""
+        return False
+
     def see(self, stored: SceneValue) -> SceneValue:
         """Decode a stored Dr.Jit value, without derivatives."""
         return stored
@@ -74,6 +79,10 @@ class Sky(Form):
 
     mono: bool
 
+    @property
+    def wraps(self) -> bool:
+        return True
+
     def see(self, stored: SceneValue) -> SceneValue:
         columns = np.array(dr.detach(stored))[:, 1:-1]
         return mi.TensorXf(np.ascontiguousarray(columns[..., :1] if self.mono else columns))
@@ -95,6 +104,10 @@ class Spectra(Form):
 
     scaled: bool = False
     inner: Form = AS_STORED
+
+    @property
+    def wraps(self) -> bool:
+        return self.inner.wraps
 
     def see(self, stored: SceneValue) -> SceneValue:
         stored = self.inner.see(dr.detach(stored))

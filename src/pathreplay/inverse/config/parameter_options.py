@@ -68,7 +68,7 @@ Initial = Annotated[
 
 
 NOT_OF_A_POSE = frozenset(
-    "lower upper resolutions refine_at large_steps_lambda parameterization total_variation l2_to_initial "
+    "lower upper resolutions refine_at pyramid large_steps_lambda parameterization total_variation l2_to_initial "
     "laplacian_weight regularizer shape".split()
 )
 
@@ -92,6 +92,8 @@ class Parameter(Table):
     refine_at: list[Count] | None = None
     """Iterations at which the second and each later resolution begin; default: the first iterations of the stages, if
     there are as many stages as resolutions."""
+    pyramid: Switch = False
+    """Take the steps in the levels of a Laplacian pyramid of a texture or volume."""
     pose: PoseKind | None = None
     """Optimise a rigid motion of the parameter, which is a to_world transform or the vertex_positions of a mesh."""
     pivot: Vector | None = None

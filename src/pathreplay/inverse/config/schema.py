@@ -290,6 +290,12 @@ class Config(Table):
                 f"optimizer: type = '{self.optimizer.type}' needs the same loss function in all iterations and has no "
                 f"learning-rate schedule; remove '{wrong[0]}', or use another type"
             )
+        for entry in self.parameters:
+            if entry.pyramid:
+                raise ValueError(
+                    f"optimizer: type = '{self.optimizer.type}' does not step the levels of a pyramid; remove "
+                    f"'pyramid' of parameter '{entry.key}', or use 'adam'"
+                )
         return self
 
     def seeds(self, stream: int, sensor: int, iteration: int = 0, count: int = 2) -> tuple[int, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from pathreplay.inverse.objective.evaluate import Executor
 from pathreplay.inverse.optim.adaptive import Optimiser, State, WhenAsked
 from pathreplay.inverse.parameters.grids import Levels
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.variables import Variable, latents
 from pathreplay.platform.atomic_files import Content
 
 
@@ -97,21 +98,22 @@ def save(run: Run) -> Content:
     return partial(sealed_chunks, WhenAsked(arrays), metadata)
 
 
-def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Collection[str] = ()) -> None:
+def restore(path: Path, run: Run, variables: Sequence[Variable], held: Collection[str] = ()) -> None:
     """Restore a run from a checkpoint.
 
     Args:
         path: the checkpoint.
         run: a new run of the same job, which is changed in place.
-        levels: refinement schedules of the variables, by key; None for variables that are not refined.
+        variables: the variables of the job.
         held: keys of variables that are frozen in some stages.
 
     Raises:
         PathreplayError: the file is damaged or invalid, or belongs to other variables.
     """
     try:
+        levels = {v.key: v.levels for v in variables}
         values, state, history, learned = _read(path, run.values, levels, held)
-        run.optimiser.restore(state, values)
+        run.optimiser.restore(state, latents(variables, values))
         run.values, run.history, run.learned = values, history, learned
         return
     except ValidationError as error:

@@ -49,6 +49,7 @@ from pathreplay.inverse.optim.lbfgs import LineSearch, Search
 from pathreplay.inverse.parameters.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.variables import latents
 from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, sensor_of
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
@@ -91,6 +92,7 @@ def new_run(
 
 def optimiser_of(problem: Problem, values: Arrays, options: Optimizer, search: Search | None = None) -> Optimiser:
     """Create the optimiser of the problem's variables at these values. For ``search`` see `LineSearch`."""
+    values = latents(problem.variables, values)
     if options.searches:
         free = -np.inf, np.inf  # coordinates enforce the bounds themselves
         bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -21,6 +21,7 @@ from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.grids import Levels, make_levels, resampled
 from pathreplay.inverse.parameters.mesh import Surface
 from pathreplay.inverse.parameters.pose import PART_NAMES, Pose, make_pose
+from pathreplay.inverse.parameters.pyramid import Pyramid
 from pathreplay.inverse.parameters.regularizers import Laplacian, Own, Penalty, Prior, Term, TotalVariation
 from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
 from pathreplay.inverse.parameters.values import Array, make_value, require_finite_array, seen
@@ -62,6 +63,11 @@ class Variable:
     def held(self, values: Array) -> dr.ArrayBase:
         """Convert an array of values to Dr.Jit. The resolution of a grid may differ from the initial resolution."""
         return type(self.like)(values) if dr.is_tensor_v(self.like) else parameters.to_value(self.like, values)
+
+
+def latents(variables: Iterable[Variable], values: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the arrays that the optimiser steps at these ``values``, by key."""
+    return {v.key: v.coordinates.latent(values[v.key]) if v.coordinates else values[v.key] for v in variables}
 
 
 def keys_of(
@@ -157,12 +163,13 @@ def make_variables(
             like = seen(params, key) if entry.shape is None else _numbers(key, entry.shape)
             start = _start(key, like, form, entry, base, starts.get(entry.key))
             bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
-            coordinates = _coordinates(params, key, entry, start)
-            if isinstance(coordinates, Transform):
-                bounded(key, rate, coordinates.latent(start))
-            else:
-                bounded(key, rate, start, (entry.lower, entry.upper))
             levels = _levels(key, entry, entry.refine_at or [], start)
+            coordinates = _coordinates(params, key, entry, start, levels, form.wraps)
+            if entry.parameterization is None:
+                bounded(key, rate, start, (entry.lower, entry.upper))
+            else:
+                assert coordinates is not None
+                bounded(key, rate, coordinates.latent(start))
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
             if dr.is_tensor_v(like):
@@ -186,15 +193,24 @@ def make_variables(
     return variables, poses
 
 
-def _coordinates(params: mi.SceneParameters, key: str, entry: Parameter, start: Array) -> Coordinates | None:
+def _coordinates(
+    params: mi.SceneParameters, key: str, entry: Parameter, start: Array, levels: Levels | None, wraps: bool
+) -> Coordinates | None:
+    transform = None
     if entry.parameterization is not None:
         transform = Transform(
             entry.parameterization, *(-np.inf if x is None else x for x in (entry.lower, entry.upper))
         )
         transform.require_inside(key, start)
-        return transform
+    if entry.pyramid:
+        if start.ndim < 3:
+            raise PathreplayError(
+                f"Parameter '{key}' of shape {start.shape} is not a texture or volume; remove 'pyramid'"
+            )
+        shapes = [start.shape, *(levels.shapes if levels else ())]
+        return Pyramid(shapes, wraps, transform)
     if entry.large_steps_lambda is None:
-        return None
+        return transform
     faces = _faces(params, key, "large_steps_lambda")
     return Surface(parameters.get_array(params[key]), faces, entry.large_steps_lambda)
 

@@ -1,0 +1,103 @@
+"""Laplacian pyramid of a grid: the optimiser steps the levels, and the grid is the sum of their interpolations.
+
+With interpolations U_j from level j to the resolution of the grid, the grid is
+
+    v = Σ_j U_j u_j,        so that        ∂/∂u_j = U_jᵀ ∂/∂v.
+
+An optimiser that normalises each entry by its own moments, such as Adam, then moves low frequencies as fast as a coarse
+grid would, with the gradient noise of a coarse grid. Entries that no path reaches follow their surroundings (Weier et
+al. 2025). The levels of a given v are not unique. Steps depend on gradients only, so the finest level is v itself here
+and all others are zero. Neither needs to be kept between steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from math import prod
+
+import numpy as np
+import scipy.sparse
+
+from pathreplay.inverse.parameters.reparameterization import Transform
+from pathreplay.inverse.parameters.values import Array
+
+Shape = tuple[int, ...]
+
+
+class Pyramid:
+    """Coordinates (`Coordinates`) of a grid: the levels of a pyramid, coarsest first, in one flat array.
+
+    Each level has half the entries of the next one along each axis, rounded up; the coarsest has one entry per channel.
+
+    Args:
+        shapes: all shapes that the grid may have, with the channels last.
+        wraps: whether the last axis but the channels is periodic, as in environment maps.
+        inner: coordinates of the entries; the pyramid is that of their latent variables. None: the values themselves.
+    """
+
+    uniform = False
+
+    def __init__(self, shapes: Sequence[Shape], wraps: bool, inner: Transform | None = None) -> None:
+        self._wraps, self.inner = wraps, inner
+        self._levels = {sum(map(prod, levels)): levels for levels in map(_levels, shapes)}
+
+    def latent(self, values: Array) -> Array:
+        """See `Coordinates`; all levels but the finest are zero."""
+        entries = values if self.inner is None else self.inner.latent(values)
+        latent = np.zeros(sum(map(prod, _levels(values.shape))), np.float32)
+        latent[latent.size - entries.size :] = entries.ravel()
+        return latent
+
+    def gradient(self, values: Array, by_values: Array) -> Array:
+        """See `Coordinates`."""
+        level = by_values if self.inner is None else self.inner.gradient(values, by_values)
+        parts = [level.ravel()]
+        for coarse in reversed(_levels(values.shape)[:-1]):
+            level = self._resize(level, coarse, transposed=True)
+            parts.append(level.ravel())
+        return np.concatenate(parts[::-1])
+
+    def values(self, latent: Array) -> Array:
+        """See `Coordinates`."""
+        first, *finer = self._levels[latent.size]
+        end = prod(first)
+        level = latent[:end].reshape(first)
+        for shape in finer:
+            begin, end = end, end + prod(shape)
+            level = self._resize(level, shape) + latent[begin:end].reshape(shape)
+        return level if self.inner is None else self.inner.values(level)
+
+    def _resize(self, level: Array, shape: Shape, transposed: bool = False) -> Array:
+        """Interpolate a level to another ``shape``, or apply the transpose of the interpolation from that shape."""
+        last = len(shape) - 2
+        for axis, n in enumerate(shape[:-1]):
+            m = level.shape[axis]
+            wraps = self._wraps and axis == last
+            matrix = _interpolation(n, m, wraps).T if transposed else _interpolation(m, n, wraps)
+            columns = np.moveaxis(level, axis, 0)
+            rows = matrix @ columns.reshape(m, -1)
+            level = np.moveaxis(rows.reshape(n, *columns.shape[1:]), 0, axis)
+        return level
+
+
+def _levels(shape: Shape) -> list[Shape]:
+    """Return the shapes of all levels, coarsest first."""
+    *axes, channels = shape
+    levels = [shape]
+    while max(axes) > 1:
+        axes = [-(-n // 2) for n in axes]
+        levels.insert(0, (*axes, channels))
+    return levels
+
+
+@cache
+def _interpolation(m: int, n: int, wraps: bool) -> scipy.sparse.csr_array:
+    """Return the matrix (n x m) that interpolates m entries linearly between cell centres at n centres."""
+    x = (np.arange(n) + 0.5) * (m / n) - 0.5
+    left = np.floor(x).astype(int)
+    weight = (x - left).astype(np.float32)
+    columns = np.stack([left, left + 1])
+    columns = columns % m if wraps else np.clip(columns, 0, m - 1)
+    weights = np.stack([1 - weight, weight])
+    return scipy.sparse.csr_array((weights.ravel(), (np.tile(np.arange(n), 2), columns.ravel())), shape=(n, m))
