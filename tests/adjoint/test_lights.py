@@ -43,7 +43,7 @@ def alone(scene: mi.Scene, *keys: str, **options: Any) -> bool:
     """What the driver says of a scene where these parameters have gradients."""
     with attached(scene, *keys), careful(), dr.suspend_grad():
         integrator = mi.load_dict({"type": "pathreplay", "max_depth": 4, **options})
-        trace = integrator._walk(scene, scene.sensors()[0])
+        trace = integrator._trace_config(scene, scene.sensors()[0])
         return only_emission_varies(trace, Pass.of(scene, 0, SEED, SPP).rays().start)
 
 

@@ -43,7 +43,7 @@ def informed(scene: mi.Scene) -> tuple[Pass, TraceConfig]:
     """A pass, and a walk that knows what moves."""
     view = Pass.of(scene, 0, 0, 1)
     ours = mi.load_dict({"type": "pathreplay", "max_depth": 2})
-    return view, Boundary.informed(view, ours._walk(scene, view.sensor))
+    return view, Boundary.informed(view, ours._trace_config(scene, view.sensor))
 
 
 def test_a_shadow_falls_where_the_picture_is_darker() -> None:

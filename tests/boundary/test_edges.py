@@ -317,7 +317,7 @@ def test_what_is_closer_than_rays_begin_is_rounding() -> None:
 
 def test_samples_of_a_ball_are_asked_for_on_a_disk() -> None:
     """As many by area, and places that are close to each other have directions that are."""
-    trace: Any = SimpleNamespace(traits=SimpleNamespace(ball_lights=True))
+    trace: Any = SimpleNamespace(traits=SimpleNamespace(sphere_lights=True))
     lamp: Any = SimpleNamespace(polar=mi.Bool(True))
     x, y = dr.meshgrid(*2 * (dr.linspace(mi.Float, 0.005, 0.995, 100),))
     u = sample_at(trace, lamp, mi.Point2f(x, y))
@@ -336,7 +336,7 @@ def test_chains_in_fog_are_not_ended_by_roulette() -> None:
     scene = mi.load_dict(media.in_fog(media.thin(), 5, front=mirrors[0], back=mirrors[1]))
     view, key = Pass.of(scene, 0, 0, 1), dr.arange(mi.UInt32, 2000)
     places = FilmPlaces.of(view)
-    trace = mi.load_dict({"type": "pathreplay", "max_depth": 8, "rr_depth": 1})._walk(scene, view.sensor)
+    trace = mi.load_dict({"type": "pathreplay", "max_depth": 8, "rr_depth": 1})._trace_config(scene, view.sensor)
     with dr.suspend_grad():
         s = mi.Point2f(quasi_random(key, 2000, mi.UInt32(1))) * places.size
         ray, reach = places.ray(s, key)[0], 0.5

@@ -53,7 +53,7 @@ def test_roughness_moves_no_edge_where_lobes_follow_their_samples() -> None:
     for key, moves in (("ball.bsdf.alpha.value", False), ("ball.to_world", True)):
         with attached(scene, key):
             view = Pass.of(scene, 0, 0, 1)
-            trace = by._walk(scene, view.sensor)
+            trace = by._trace_config(scene, view.sensor)
             assert trace.follows and Boundary.move(view, trace) is moves, key
 
 
@@ -115,7 +115,7 @@ def test_what_moves_edges_is_what_can_hide_light_or_is_seen_from(room: mi.Scene)
     for key in MOVES + STAYS:
         with attached(room, key), dr.suspend_grad():
             view = Pass.of(room, 0, 0, 1)
-            found[key] = Boundary.move(view, integrator._walk(room, view.sensor))
+            found[key] = Boundary.move(view, integrator._trace_config(room, view.sensor))
             *_, terms = integrator._planned(view, integrator.begin(room))
             assert any(isinstance(term, Boundary | FilmMotion) for term in terms) == found[key]
     assert found == dict.fromkeys(MOVES, True) | dict.fromkeys(STAYS, False)

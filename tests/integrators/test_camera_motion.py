@@ -177,7 +177,7 @@ def test_hits_stay_short_of_the_end_of_a_spline(tmp_path: Path) -> None:
     """There Mitsuba looks for a segment that does not exist: see `meet`. Rays are aimed at the rim of the last one."""
     (tmp_path / "tube.txt").write_text("\n".join(f"{x} 0 0 0.2" for x in range(5)))
     scene = mi.load_dict({"type": "scene", "tube": {"type": "bsplinecurve", "filename": str(tmp_path / "tube.txt")}})
-    trace = mi.load_dict({"type": "pathreplay"})._walk(scene, None)
+    trace = mi.load_dict({"type": "pathreplay"})._trace_config(scene, None)
     x = 3 + dr.arange(mi.Float, 4096) * np.float32(2**-22) - np.float32(2**-11)
     hit = meet(trace, mi.Ray3f(mi.Point3f(x, 0, 1), mi.Vector3f(0, 0, -1)), mi.Bool(True))
     met = np.array(hit.is_valid())

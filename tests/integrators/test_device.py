@@ -39,7 +39,7 @@ def room() -> mi.Scene:
 
 def walk_of(scene: mi.Scene, max_depth: int = 6) -> Any:
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": max_depth})
-    return integrator._walk(scene, scene.sensors()[0])
+    return integrator._trace_config(scene, scene.sensors()[0])
 
 
 @pytest.fixture

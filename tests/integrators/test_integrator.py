@@ -404,7 +404,7 @@ def test_nothing_moves_when_only_a_smooth_lobe_changes() -> None:
     for key, moves in (("object.bsdf.alpha.value", False), ("object.to_world", True), ("sky.radiance.value", False)):
         dr.enable_grad(params[key])
         params.update()
-        trace = plugin()._walk(scene, None)
+        trace = plugin()._trace_config(scene, None)
         with dr.suspend_grad():
             start = CameraStart(ray, None, mi.Bool(True))
             assert path_moves(trace, start, start.choose(trace, mi.Bool(True))) == moves, key

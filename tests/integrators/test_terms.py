@@ -142,7 +142,7 @@ def test_what_was_learned_outlives_another_scene_between(load) -> None:
 def test_what_shards_have_seen_can_be_added(load) -> None:
     scene, _ = load(foggy(), DENSITY)
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "null_branching": True})
-    trace = integrator._walk(scene, scene.sensors()[0])
+    trace = integrator._trace_config(scene, scene.sensors()[0])
     nothing = BaselineState.fresh(scene.bbox())
 
     def seen(seed: int) -> BaselineStats:
@@ -169,16 +169,16 @@ def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:
     glow = lit_room(DIFFUSE)
     scene, params = load(glow, COLOUR)
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
-    before = integrator._walk(scene, None)
+    before = integrator._trace_config(scene, None)
     facts = facts_of(scene)
     assert not before.traits.lights_vary
     light = "light.emitter.radiance.value"
     dr.enable_grad(params[light])
     params.update()
-    assert integrator._walk(scene, None).traits.lights_vary
+    assert integrator._trace_config(scene, None).traits.lights_vary
     dr.disable_grad(params[light])
     params.update()
-    after = integrator._walk(scene, None).traits
+    after = integrator._trace_config(scene, None).traits
     assert facts_of(scene) is facts
     changed = [f.name for f in fields(after) if getattr(after, f.name) is not getattr(before.traits, f.name)]
     assert changed == []
@@ -186,14 +186,14 @@ def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:
     key = "object.to_world"
     params[key] = mi.Transform4f().scale(3) @ mi.Transform4f(params[key])
     params.update()
-    grown = integrator._walk(scene, None).traits.tables.blend_lengths
+    grown = integrator._trace_config(scene, None).traits.tables.blend_lengths
     assert np.array(grown).max() >= np.array(before.traits.tables.blend_lengths).max()
     assert not np.array_equal(np.array(grown), np.array(before.traits.tables.blend_lengths))
     # Another BSDF on a shape, and another scene.
     scene.shapes()[0].set_bsdf(mi.load_dict({"type": "conductor"}))
-    assert integrator._walk(scene, None).traits.lobes == 1
+    assert integrator._trace_config(scene, None).traits.lobes == 1
     other = mi.load_dict(lit_room({"type": "dielectric_ad"}))
-    assert integrator._walk(other, None).traits.lobes == 2
+    assert integrator._trace_config(other, None).traits.lobes == 2
     assert facts_of(other) is not facts_of(scene)
 
 

@@ -10,7 +10,7 @@ import pytest
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.loop.loop import judged, new_run, render_views
+from pathreplay.inverse.loop.loop import image_error, new_run, render_views
 from pathreplay.inverse.parameters.grids import rmse
 from pathreplay.inverse.problem.problem import build_problem
 from pathreplay.jobs import make_config, optimize
@@ -83,12 +83,12 @@ def test_judgement_is_free_of_the_noise_of_rendering(tmp_path: Path) -> None:
     config = make_config({**JOB, "spp": 16, "baseline": RIVAL, "sensors": ["left"], "target": SHARP})
     problem = build_problem(config, Path.cwd())
     values = new_run(problem, problem.integrator).values
-    gap = judged(problem, values, 0)
+    gap = image_error(problem, values, 0)
     for variable in problem.variables:
         assert variable.truth is not None
         values[variable.key] = variable.truth
     noisy = rmse(render_views(problem, values)["left"], problem.views[0].target)
-    left = max(judged(problem, values, i) for i in range(4))
+    left = max(image_error(problem, values, i) for i in range(4))
     assert left < 0.1 * gap and left < 0.3 * noisy
 
 

@@ -137,7 +137,7 @@ def driven(driver: Callable[..., Any], scene: mi.Scene, *keys: str, max_depth: i
         with dr.suspend_grad(), dr.isolate_grad():
             rays = Pass.of(scene, 0, SEED, SPP).rays()
             δL = mi.Spectrum(ray_weights(dr.width(rays.ray)))
-            moves = driver(ours(max_depth)._walk(scene, scene.sensors()[0]), rays.start, δL, NonFiniteCounter())
+            moves = driver(ours(max_depth)._trace_config(scene, scene.sensors()[0]), rays.start, δL, NonFiniteCounter())
             dr.eval()
         return gradients(params, keys), moves
 
@@ -153,7 +153,8 @@ def driven_forward(
     """The tangents of all rays by a driver, which rays met anything, and whether it says that paths move."""
     with moving(scene, *keys), careful(), dr.suspend_grad():
         rays = Pass.of(scene, 0, SEED, SPP).rays()
-        δL, valid, moves = driver(ours(max_depth)._walk(scene, scene.sensors()[0]), rays.start, NonFiniteCounter())
+        trace = ours(max_depth)._trace_config(scene, scene.sensors()[0])
+        δL, valid, moves = driver(trace, rays.start, NonFiniteCounter())
         dr.eval(δL, valid)
         return np.array(δL), np.array(valid), moves
 

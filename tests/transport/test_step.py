@@ -14,7 +14,7 @@ import pytest
 from media_scenes import constant, grid
 from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative
 from pathreplay.adjoint.record import Layout, record_type, room_for
-from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, first_walk, walk_back
+from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, record_path, sweep_path
 from pathreplay.integrators.lifetimes import careful
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
@@ -51,7 +51,7 @@ def fog(bsdf: dict[str, Any]) -> mi.Scene:
 
 
 def walk_of(scene: mi.Scene, **properties: Any) -> TraceConfig:
-    return mi.load_dict({"type": "pathreplay", **properties})._walk(scene, None)
+    return mi.load_dict({"type": "pathreplay", **properties})._trace_config(scene, None)
 
 
 def sampler() -> mi.Sampler:
@@ -170,9 +170,9 @@ def back(scene: mi.Scene, L: float, q: RayDerivative, δL: float) -> mi.Spectrum
         layout = Layout.of(trace, path_moves(trace, start, path.at))
         records = dr.alloc_local(record_type(layout), room_for(trace))
         lost, first = NonFiniteCounter(), mi.UInt32(0)
-        records, count, _, _, _ = first_walk(trace, start.sampler, path, layout, records, first, lost)
+        records, count, _, _, _ = record_path(trace, start.sampler, path, layout, records, first, lost)
         recorded = RecordedPath(layout, records, first, mi.UInt32(1), count - 1, dr.detach(ray))
-        L = walk_back(trace, recorded, PathAdjoint(mi.Spectrum(δL), mi.Spectrum(L), q), lost).L
+        L = sweep_path(trace, recorded, PathAdjoint(mi.Spectrum(δL), mi.Spectrum(L), q), lost).L
         dr.eval(L)
     return L
 

@@ -125,7 +125,7 @@ class Baseline:
     known: mi.Float  # the averages
     branching: mi.Float
 
-    def look(self, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
+    def lookup(self, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
         """Look up the baseline at an interaction, for radiance from the direction -mei.wi; σ̄ is the majorant."""
         mei, σ_t = dr.detach(mei), dr.detach(σ_t)
         cell = self.cells.index(mei.p, -mei.wi)

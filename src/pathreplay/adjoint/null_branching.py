@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import backward
-from pathreplay.adjoint.primal import walk_on
+from pathreplay.adjoint.primal import path_radiance
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.path import PathState, next_arrival
 from pathreplay.transport.step import Visit, choose_step
@@ -79,7 +79,7 @@ def branch_term(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ra
         visit = Visit(at, one, branch.depth + 1 < trace.max_depth, active)
         step = choose_step(onward, visit, u, sampler, flight)
         at_next = next_arrival(onward, at, step, step.active)
-        L, _ = walk_on(onward, sampler, PathState(at_next, one, None, branch.η, branch.depth + 1, step.active))
+        L, _ = path_radiance(onward, sampler, PathState(at_next, one, None, branch.η, branch.depth + 1, step.active))
         L_s = step.e + step.w * L
     mei = interaction(branch.medium, at.ray, mi.Float(0))
     σ_s, _, σ_t = branch.medium.get_scattering_coefficients(mei, active)

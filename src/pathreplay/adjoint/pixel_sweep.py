@@ -25,7 +25,7 @@ import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative
 from pathreplay.adjoint.record import Layout, record_type, room_for
-from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, first_walk, walk_back
+from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, record_path, sweep_path
 from pathreplay.samplers.pixel_samples import PixelSamples
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.motion import path_moves
@@ -77,7 +77,7 @@ def pixel_sweep(
         ray, β = camera(sampler, mi.Bool(trace.max_depth > 0))
         path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)), sustained=True)
         path.β, path.β_alive = mi.Spectrum(β), mi.Spectrum(β)
-        records, count, L, beyond, _branch = first_walk(trace, sampler, path, layout, records, s * room, lost)
+        records, count, L, beyond, _branch = record_path(trace, sampler, path, layout, records, s * room, lost)
         counts[s], ends[s] = count, beyond
         sets[s // size] += L
         total += L
@@ -89,6 +89,6 @@ def pixel_sweep(
         δL = (loss.offset + loss.slope * ((total - sets[s // size]) / others)) / paths
         first, count = s * room, mi.UInt32(counts[s])
         recorded = RecordedPath(layout, records, first, count, first + count - 1, ray0)
-        walk_back(trace, recorded, PathAdjoint(δL, mi.Spectrum(ends[s]), RayDerivative.zero()), lost)
+        sweep_path(trace, recorded, PathAdjoint(δL, mi.Spectrum(ends[s]), RayDerivative.zero()), lost)
 
     return layout.moves, total / paths

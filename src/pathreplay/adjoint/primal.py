@@ -21,12 +21,12 @@ def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool
     Nothing is differentiated.
     """
     path = PathState.begin(trace, start)
-    L, valid = walk_on(trace, start.sampler, path)
+    L, valid = path_radiance(trace, start.sampler, path)
     return L, valid | (trace.background_is_opaque & path.active)
 
 
 @dr.syntax
-def walk_on(trace: TraceConfig, sampler: Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
+def path_radiance(trace: TraceConfig, sampler: Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
     """Continue a path from its present state; return the radiance along the path, and ``valid`` (see `primal`).
 
     The throughput ``path.β`` must be one, because it is a factor of the result. The background makes no path valid.

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import NonFiniteCounter, backward
 from pathreplay.adjoint.null_branching import Branch, branch_backward
-from pathreplay.adjoint.primal import walk_on
+from pathreplay.adjoint.primal import path_radiance
 from pathreplay.adjoint.ray_jacobian import Recovery, has_smooth_lobes
 from pathreplay.adjoint.record import MAX_DEPTH_MEDIA
 from pathreplay.adjoint.replay_attached import replay_attached
@@ -77,7 +77,7 @@ def _replay_still(trace: TraceConfig, start: CameraStart, path: PathState, δL: 
     this value times dw_i / w_i.
     """
     sampler, ray0 = start.sampler, path.at.ray
-    L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, updated at each vertex
+    L = path_radiance(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, updated at each vertex
     branch = Branch.none()
 
     while dr.hint(path.active, exclude=[trace], label="pathreplay: replay"):

@@ -14,7 +14,7 @@ from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative, backwar
 from pathreplay.adjoint.baseline import BaselineStats
 from pathreplay.adjoint.null_branching import branch_backward
 from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
-from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, first_walk, walk_back
+from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, record_path, sweep_path
 from pathreplay.errors import PathreplayError
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
@@ -45,10 +45,10 @@ def sweep(
     moves = path_moves(trace, start, path.at)
     layout = Layout.of(trace, moves)
     records = dr.alloc_local(record_type(layout), room_for(trace))
-    records, count, _, L, branch = first_walk(trace, start.sampler, path, layout, records, mi.UInt32(0), lost)
+    records, count, _, L, branch = record_path(trace, start.sampler, path, layout, records, mi.UInt32(0), lost)
 
     recorded = RecordedPath(layout, records, mi.UInt32(0), count, count - 1, ray0)
-    q = walk_back(trace, recorded, PathAdjoint(δL, L, RayDerivative.zero()), lost, seen).q
+    q = sweep_path(trace, recorded, PathAdjoint(δL, L, RayDerivative.zero()), lost, seen).q
     if trace.branch:
         if seen is not None:
             seen.tally(branch.number)

@@ -18,7 +18,7 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 @dr.syntax
-def first_walk(
+def record_path(
     trace: TraceConfig,
     sampler: Sampler,
     path: PathState,
@@ -87,7 +87,7 @@ class PathAdjoint:
 
 
 @dr.syntax
-def walk_back(
+def sweep_path(
     trace: TraceConfig,
     path: RecordedPath,
     adjoint: PathAdjoint,

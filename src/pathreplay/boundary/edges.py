@@ -31,7 +31,7 @@ from pathreplay.adjoint.autodiff import (
     tangents,
 )
 from pathreplay.adjoint.record import Layout, read_back
-from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, walk_back
+from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, sweep_path
 from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.transport.vertex import TraceConfig
 
@@ -141,4 +141,4 @@ def ray_to_camera(
     k, none = path.k, mi.Spectrum(0)
     ray0 = dr.detach(film.ray(path.s, path.key)[0])
     recorded = RecordedPath(path.layout, path.records, mi.UInt32(0), mi.UInt32(k), mi.UInt32(k), ray0)
-    return walk_back(trace, recorded, PathAdjoint(none, none, q), lost, rays_only=rays_only).q
+    return sweep_path(trace, recorded, PathAdjoint(none, none, q), lost, rays_only=rays_only).q

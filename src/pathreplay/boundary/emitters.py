@@ -29,8 +29,8 @@ from pathreplay.boundary.crofton import (
     heading,
     probe_positions,
 )
+from pathreplay.boundary.importance import STEEP, Importance, closeness, own_plane
 from pathreplay.boundary.observer import ObserverVertex
-from pathreplay.boundary.worth import STEEP, Worth, closeness, own_plane
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.signature import edge_normal, outline_gap
@@ -59,7 +59,7 @@ class SampledEmitter:
         """Look up an emitter by its index in the scene."""
         ptr = dr.gather(mi.EmitterPtr, trace.scene.emitters_dr(), index, active)
         polar = mi.Bool(False)
-        if trace.traits.ball_lights:
+        if trace.traits.sphere_lights:
             polar = ptr.get_shape().shape_type() == int(mi.ShapeType.Sphere)
         if not trace.traits.mesh_lights:
             return SampledEmitter(ptr, mi.Point3f(0), mi.Float(0), polar)
@@ -95,7 +95,7 @@ def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi
 
 def sample_at(trace: TraceConfig, emitter: SampledEmitter, u: mi.Point2f) -> mi.Point2f:
     """Return an emitter's random numbers at a position of the square; for a sphere, through an equal-area disk map."""
-    if not trace.traits.ball_lights:
+    if not trace.traits.sphere_lights:
         return u
     p = mi.warp.square_to_uniform_disk_concentric(u)
     turn = dr.inv_two_pi * dr.atan2(p.y, p.x)
@@ -201,7 +201,7 @@ class EmitterSegment(PlaneSegment):
         moving = moves | self.emitter.may_move(trace) | may_move(trace, sample.hit)
         return VisibilityProbe.of(sample.hidden & moving)
 
-    def detect(self) -> Worth:
+    def detect(self) -> Importance:
         """Estimate the importance of an edge; without narrow lobes, evaluate scattering only in the middle."""
         trace, x, active = self.observer.trace, self.observer.selected, self.observer.active
         samples = [self.probe_emitter(t, active) for t in probe_positions(self.length)]
@@ -217,7 +217,7 @@ class EmitterSegment(PlaneSegment):
         first = reduce(lambda p, q: dr.select(q.hidden & ~(p.hidden & (p.hit.t <= q.hit.t)), q, p), samples)
         survey.near = dr.select(first.hidden, closeness(trace, first.hit), 0)
         turn = dr.norm(a - c) + dr.norm(c - b)
-        return Worth.of(survey, survey.bright, own_plane(self.observer, a, b) / (turn + self.length * STEEP))
+        return Importance.of(survey, survey.bright, own_plane(self.observer, a, b) / (turn + self.length * STEEP))
 
     def _mis(self, sample: EmitterProbe, pdf: mi.Float) -> mi.Float:
         """Return the MIS weight of an emitter sample; ``pdf`` is the density of the BSDF."""

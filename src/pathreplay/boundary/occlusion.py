@@ -12,14 +12,14 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import derivative_by_ray
-from pathreplay.adjoint.primal import walk_on
+from pathreplay.adjoint.primal import path_radiance
 from pathreplay.boundary.arcs import Arc
 from pathreplay.boundary.creases import Crease, off_contact
 from pathreplay.boundary.crofton import Bracket, Survey, VisibilityProbe, bisect, probe_positions
 from pathreplay.boundary.edges import Crossing
 from pathreplay.boundary.hard_shadows import HardShadow, ShadowTest
+from pathreplay.boundary.importance import DIM, Importance, closeness, own_plane
 from pathreplay.boundary.observer import ObserverVertex
-from pathreplay.boundary.worth import DIM, Worth, closeness, own_plane
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import may_move
@@ -83,18 +83,18 @@ class ArcSegment(Arc):
         return glows | (self.observer.selected.depth + 2 < trace.max_depth)
 
     def _shadow_test(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> ShadowTest:
-        """Test the shadow of the light that `walk_on` samples at the hit."""
+        """Test the shadow of the light that `path_radiance` samples at the hit."""
         sampler, depth = CounterSampler.stream(self.key, Stream.BEYOND_EDGE), self.observer.selected.depth
         arrival = self.observer.arrival(ray, hit, mi.Float(1))
         return ShadowTest.of(self.observer.trace, arrival, sampler, depth + 1, active)
 
-    def detect(self) -> Worth:
+    def detect(self) -> Importance:
         """Estimate the importance of an edge on the arc."""
         light = dr.select(self.active, dr.mean(dr.abs(self.observer.selected.β * self.f)) / self.p, 0)
         a, b, c = probe_positions(self.length)
         survey = Survey.of([self.probe(t, self.active) for t in (a, b, c)], self.active)
         survey.presence *= self.importance()
-        return Worth.of(survey, light, light * own_plane(self.observer, self.at(a), self.at(b)) / self.longest)
+        return Importance.of(survey, light, light * own_plane(self.observer, self.at(a), self.at(b)) / self.longest)
 
     def resolve(self, weight: mi.Float, generator: mi.PCG32) -> list[Crossing]:
         """Bisect the arc, and weigh both sides of the edge: see `EdgeSearch.resolve`."""
@@ -134,7 +134,7 @@ class ArcSegment(Arc):
         K, depth = [], x.depth + 1
         for arrival in arrivals:
             path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < trace.max_depth))
-            L, _ = walk_on(trace, CounterSampler.stream(self.key, Stream.BEYOND_EDGE), path)
+            L, _ = path_radiance(trace, CounterSampler.stream(self.key, Stream.BEYOND_EDGE), path)
             K.append(dr.select(active, common * T * L, 0))
         return K[0], K[1]
 

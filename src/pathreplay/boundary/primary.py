@@ -32,7 +32,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import NonFiniteCounter, derivative_by_place, derivative_by_ray
-from pathreplay.adjoint.primal import walk_on
+from pathreplay.adjoint.primal import path_radiance
 from pathreplay.boundary.chains import (
     ChainSplit,
     chain_config,
@@ -83,7 +83,7 @@ class PrimarySearch(FilmSearch[FilmSegment]):
     def guided(self, n: int, seed: mi.UInt32) -> PrimarySearch:
         """Refine the density with a pilot pass, whose segments are twice as long: see `EdgeSearch`."""
         wide, n_pilot = replace(self, length=2 * self.length), pilot_size(n, self.film.size)
-        pilot = wide.draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.FIRST_LOOK.of(seed))
+        pilot = wide.draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.PILOT.of(seed))
         return replace(self, density=self.density.refined(pilot.c, wide.detect(pilot) * pilot.density))
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> FilmSegment:
@@ -129,7 +129,7 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         f = []
         for side in sides:
             path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(split.k), mi.Bool(active))
-            f.append(walk_on(onward, CounterSampler.at_vertex(key, split.k), path)[0])
+            f.append(path_radiance(onward, CounterSampler.at_vertex(key, split.k), path)[0])
         return T * (f[0] - f[1])
 
     def slope(self, segment: FilmSegment, edges: Edges) -> mi.Vector2f:

@@ -26,10 +26,10 @@ from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
 from pathreplay.boundary.cast_shadows import cast_shadows, casters
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
 from pathreplay.boundary.emitters import EmitterSegment
+from pathreplay.boundary.importance import MOST, UNFORESEEN, Importance, radiance_of, weighed
 from pathreplay.boundary.observer import ObserverVertex, SelectedVertex, choose_vertex
 from pathreplay.boundary.occlusion import ArcSegment
 from pathreplay.boundary.search import EdgeSearch, SegmentDensity, pilot_size
-from pathreplay.boundary.worth import MOST, UNFORESEEN, Worth, radiance_of, weighed
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.vertex import TraceConfig
@@ -73,16 +73,16 @@ class SecondarySearch(EdgeSearch[CameraPath]):
             s, falls = cast_shadows(self.trace, shapes, self.film, Stream.CAST_SHADOWS.of(seed))
             density = density.refined(s, dr.select(falls, mi.Float(1), 0), UNGUIDED)
         n_pilot = pilot_size(n, self.film.size)
-        pilot = replace(self, density=density).draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.FIRST_LOOK.of(seed))
-        worths = self._worths(pilot)
-        radiance = radiance_of(worths)
-        worth = weighed(worths, radiance)[1]
+        pilot = replace(self, density=density).draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.PILOT.of(seed))
+        importances = self._importances(pilot)
+        radiance = radiance_of(importances)
+        importance = weighed(importances, radiance)[1]
         s = mi.Point2f(*(dr.concat([x, x]) for x in pilot.s))
         relative_density = dr.concat([pilot.density, pilot.density]) * (density.width * density.height)
-        mean_worth = dr.rcp(
-            dr.maximum(dr.sum(dr.select(worth > 0, dr.rcp(relative_density), 0)), dr.smallest(mi.Float))
+        mean_importance = dr.rcp(
+            dr.maximum(dr.sum(dr.select(importance > 0, dr.rcp(relative_density), 0)), dr.smallest(mi.Float))
         )
-        relative = dr.minimum(worth * relative_density / (MOST * mean_worth), 1)
+        relative = dr.minimum(importance * relative_density / (MOST * mean_importance), 1)
         return replace(
             self, density=density.refined(s, dr.square(relative) / relative_density, UNGUIDED), radiance=radiance
         )
@@ -97,8 +97,8 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     def detect(self, segments: CameraPath) -> mi.Float:
         """Return the importance of all segments in emitter squares, followed by the importance of all arcs."""
         assert self.radiance is not None
-        presence, worth = weighed(self._worths(segments), self.radiance)
-        return worth + UNFORESEEN * presence
+        presence, importance = weighed(self._importances(segments), self.radiance)
+        return importance + UNFORESEEN * presence
 
     def resolve(self, segments: CameraPath, weight: mi.Float, generator: mi.PCG32) -> Edges:
         layout = Layout.of(self.trace, True)
@@ -128,12 +128,12 @@ class SecondarySearch(EdgeSearch[CameraPath]):
             ArcSegment.draw(observer, arc, narrow, Stream.ARCS.of(key), active),
         )
 
-    def _worths(self, path: CameraPath) -> list[Worth]:
+    def _importances(self, path: CameraPath) -> list[Importance]:
         """Estimate the importance of the segments in emitter squares, and of the arcs."""
         _, x = self._vertex(path, None, None)
         none = dr.zeros(mi.Float, dr.width(path.key))
         path.density += none  # broadcast to the number of paths
-        worths = [segment.detect() for segment in self._segments(ObserverVertex(self.trace, x), path.key)]
-        worths = [replace(w, presence=w.presence / path.density, edges=w.edges + none) for w in worths]
-        dr.eval(path.s, path.density, worths)
-        return worths
+        importances = [segment.detect() for segment in self._segments(ObserverVertex(self.trace, x), path.key)]
+        importances = [replace(w, presence=w.presence / path.density, edges=w.edges + none) for w in importances]
+        dr.eval(path.s, path.density, importances)
+        return importances

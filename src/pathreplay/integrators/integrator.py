@@ -196,7 +196,7 @@ class PathReplayIntegrator(PathIntegrator):
         if self.boundary in ("none", "primary"):
             return ""
         with self._pass_context():
-            trace = self._walk(view.scene, view.sensor)
+            trace = self._trace_config(view.scene, view.sensor)
             follows = Boundary.move(view, trace) and not Boundary.obstacle(view) and self._may_follow(view, trace)
         return "film positions follow moving surfaces; take boundary = 'none'" if follows else ""
 

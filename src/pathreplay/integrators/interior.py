@@ -126,4 +126,4 @@ class PathReplay:
         branching = None
         if trace.media.branches if self.branch == "auto" else self.branch:
             branching = dr.opaque(mi.Float, FIRST_BRANCHING) if learned is None else learned.branching
-        return replace(trace, baseline=None if learned is None else learned.look, branching=branching)
+        return replace(trace, baseline=None if learned is None else learned.lookup, branching=branching)

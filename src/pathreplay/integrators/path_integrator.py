@@ -160,7 +160,7 @@ class PathIntegrator:
         total = None
         for part in parts(view):
             with self._pass_context():
-                total = _sum(total, image(part, self._walk(part.scene, part.sensor, state)), part.share)
+                total = _sum(total, image(part, self._trace_config(part.scene, part.sensor, state)), part.share)
         assert total is not None
         return total
 
@@ -197,7 +197,7 @@ class PathIntegrator:
         """
         if mode != dr.ADMode.Primal:
             raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
-        return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
+        return *primal(self._trace_config(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
 
     def begin(self, scene: mi.Scene) -> PassState:
         """Create the state of a pass over a scene.
@@ -216,7 +216,7 @@ class PathIntegrator:
 
     def _planned(self, view: Pass, state: PassState) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """Return the gradient pass with its film flow, its trace configuration, and the terms to add."""
-        return view, self._walk(view.scene, view.sensor, state), self.terms
+        return view, self._trace_config(view.scene, view.sensor, state), self.terms
 
     def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:
         """Return the control variate that this pass may use, or None."""
@@ -244,7 +244,7 @@ class PathIntegrator:
         with careful(), dr.suspend_grad():
             yield
 
-    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
+    def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
         """Build the trace configuration; ``sensor`` may be inside a medium. ``state`` None means a new state."""
         facts, state = facts_of(scene), PathIntegrator.begin(self, scene) if state is None else state
         return TraceConfig(
@@ -265,7 +265,7 @@ class PathIntegrator:
         """
         view = Pass.of(scene, sensor, 0, 1)
         with self._pass_context():
-            trace, start = self._walk(scene, view.sensor), view.rays().start
+            trace, start = self._trace_config(scene, view.sensor), view.rays().start
             if trace.media is not None or trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
                 return True
             at = PathState.begin(trace, start).at

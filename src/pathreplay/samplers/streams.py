@@ -18,7 +18,7 @@ class Stream(IntEnum):
 
     # Combined with the seed of a pass.
     BOUNDARY = 0x5EED  # the boundary term; the interior term uses the seed itself
-    FIRST_LOOK = 0x7F4A7C15  # pilot segments, whose results determine where later segments are sampled
+    PILOT = 0x7F4A7C15  # pilot segments, whose results determine where later segments are sampled
     CAST_SHADOWS = 0x2C1B3C6D
     PRIMARY_KEYS = 0x51ED270B
     SECONDARY_KEYS = 0x2545F491

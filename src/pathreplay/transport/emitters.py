@@ -80,15 +80,15 @@ def redraw_emitter(
         if trace.traits.lights_deform:
             Le *= _mesh_growth(scene, origin, light, lit & ~painted)
         if trace.traits.painted_meshes:
-            glued, glow = _glued(trace, origin, still, painted)
-            light, Le = dr.select(painted, glued, light), dr.select(painted, glow, Le)
+            at_fixed_point, glow = _at_fixed_point(trace, origin, still, painted)
+            light, Le = dr.select(painted, at_fixed_point, light), dr.select(painted, glow, Le)
         return light, Le
     if light is None:
         light, _ = draw_emitter(scene, origin, u, lit, visible=False)
     return light, scene.eval_emitter_direction(origin, light, lit) * dr.detach(reciprocal(light.pdf))
 
 
-def _glued(
+def _at_fixed_point(
     trace: TraceConfig, origin: mi.Interaction3f, still: mi.DirectionSample3f, active: mi.Bool
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
     """Attach a sample on a textured emissive mesh to fixed barycentric coordinates; return the sample with Le/p.

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import NonFiniteCounter, backward
-from pathreplay.adjoint.primal import walk_on
+from pathreplay.adjoint.primal import path_radiance
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.baselines.collisions import differentiate_flight, differentiate_shadow
 from pathreplay.transport import arrive, scatter
@@ -42,7 +42,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
     sampler, path = start.sampler, PathState.begin(trace, start)
     if dr.hint(path_moves(trace, start, path.at), mode="scalar"):
         raise PathreplayError("prb_volume_listing does not differentiate motion: use 'pathreplay'")
-    L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i; the loop subtracts β_i e_i at each vertex
+    L = path_radiance(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i; the loop subtracts β_i e_i at each vertex
     ctx = mi.BSDFContext()
 
     while dr.hint(path.active, exclude=[trace, ctx], label="pathreplay: listing"):

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import NonFiniteCounter, backward
-from pathreplay.adjoint.primal import walk_on
+from pathreplay.adjoint.primal import path_radiance
 from pathreplay.errors import PathreplayError
 from pathreplay.transport.path import PathState, next_arrival
 from pathreplay.transport.start import CameraStart
@@ -47,7 +47,7 @@ def radiative(
             L = mi.Spectrum(dr.select(step.active, 1, 0))
         else:
             depth, η = path.passed(trace, step), path.η * step.eta
-            L, _ = walk_on(trace, sampler, PathState(at, mi.Spectrum(1), None, η, depth, step.active))
+            L, _ = path_radiance(trace, sampler, PathState(at, mi.Spectrum(1), None, η, depth, step.active))
         onward, v = path.advance(trace, u, step, at)
         with dr.resume_grad():
             repeated = repeat_step(trace, replace(v, go_on=step.active), False, path.active)

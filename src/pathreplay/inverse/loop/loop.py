@@ -145,7 +145,7 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
             # Measure the image errors after the first iteration, and after each tenth of all iterations.
             if i == 0 or JUDGEMENTS * i // config.iterations < JUDGEMENTS * (i + 1) // config.iterations:
                 for measured in (run, baseline):
-                    error = judged(problem, measured.values, i)
+                    error = image_error(problem, measured.values, i)
                     measured.history[-1] = replace(measured.history[-1], picture_error=error)
         for key, ratio in noise.ratios(run.history).items():
             if ratio < noise.FAINT and key not in faint:
@@ -368,7 +368,7 @@ def with_exposures(problem: Problem, values: Arrays) -> Arrays:
     return with_held_out(values, pictures)
 
 
-def judged(problem: Problem, values: Arrays, iteration: int) -> float:
+def image_error(problem: Problem, values: Arrays, iteration: int) -> float:
     """Estimate the root mean square error of the training views without rendering noise.
 
     Two independent renderings A and B of an image I satisfy E[(A - T)(B - T)] = (I - T)², whereas E[(A - T)²] would

@@ -68,7 +68,7 @@ class Traits:
     projectors: tuple[mi.Emitter, ...]  # projectors: the region that they light has a hard boundary
     spots: tuple[mi.Emitter, ...]  # spot lights: their cone has a hard boundary if beam_width >= cutoff_angle
     mesh_lights: bool  # some mesh emits
-    ball_lights: bool  # some sphere emits
+    sphere_lights: bool  # some sphere emits
     coarse_meshes: bool  # some smooth-shaded mesh is coarse: see `is_coarse`
     brushed_meshes: bool  # some coarse mesh has a BSDF that depends on the tangent
     painted_meshes: bool  # some mesh emits with a textured radiance
@@ -110,11 +110,11 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         projectors=tuple(light for light in scene.emitters() if light.class_name() == PROJECTOR),
         spots=tuple(light for light in scene.emitters() if light.class_name() == SPOT),
-        mesh_lights=any(_ball(lamp)[3] > 0 for lamp in _mesh_lamps(shapes)),
-        ball_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
+        mesh_lights=any(_bounding_sphere(mesh)[3] > 0 for mesh in _mesh_emitters(shapes)),
+        sphere_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
         coarse_meshes=bool(coarse),
         brushed_meshes=any(is_brushed(shape.bsdf()) for shape in coarse),
-        painted_meshes=any(is_painted(lamp.emitter()) for lamp in _mesh_lamps(shapes)),
+        painted_meshes=any(is_painted(mesh.emitter()) for mesh in _mesh_emitters(shapes)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         copies=any(shape.class_name() == INSTANCE for shape in shapes),
         splines=any(shape.shape_type() == mi.ShapeType.BSplineCurve for shape in shapes),
@@ -211,16 +211,16 @@ def is_brushed(bsdf: mi.BSDF) -> bool:
 
 def emitter_bounds(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:
     """Return the bounding sphere of each emitter of the scene: centre, and radius (0 for all but mesh emitters)."""
-    lamps = {lamp.emitter(): lamp for lamp in _mesh_lamps(shapes)}
-    balls = [_ball(lamps[emitter]) if emitter in lamps else np.zeros(4) for emitter in emitters]
-    return _array(mi.Float, np.ravel(balls or [np.zeros(4)]))  # an empty array would crash the process
+    meshes = {mesh.emitter(): mesh for mesh in _mesh_emitters(shapes)}
+    spheres = [_bounding_sphere(meshes[emitter]) if emitter in meshes else np.zeros(4) for emitter in emitters]
+    return _array(mi.Float, np.ravel(spheres or [np.zeros(4)]))  # an empty array would crash the process
 
 
-def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Mesh]:
+def _mesh_emitters(shapes: list[mi.Shape]) -> list[mi.Mesh]:
     return [shape for shape in shapes if shape.is_emitter() and is_mesh(shape)]
 
 
-def _ball(mesh: mi.Mesh) -> np.ndarray:
+def _bounding_sphere(mesh: mi.Mesh) -> np.ndarray:
     """Return a bounding sphere around the box centre; radius 0 for a rectangle, whose vertices are not accessible."""
     params = mi.traverse(mesh)
     if "vertex_positions" not in params:

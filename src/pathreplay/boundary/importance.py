@@ -29,7 +29,7 @@ STEEP = 0.03
 
 
 @dataclass
-class Worth:
+class Importance:
     """Importance of a segment."""
 
     presence: mi.Float  # see `Survey`
@@ -37,10 +37,10 @@ class Worth:
     light: mi.Float  # scattered radiance, from emitters or from arcs
 
     @staticmethod
-    def of(survey: Survey, light: mi.Float, scale: mi.Float) -> Worth:
+    def of(survey: Survey, light: mi.Float, scale: mi.Float) -> Importance:
         """Compute the importance from a survey and all other factors (``scale``). Non-finite values become zero."""
         edges = survey.presence * survey.near * survey.bright * scale
-        return Worth(_finite(survey.presence), _finite(edges), _finite(light))
+        return Importance(_finite(survey.presence), _finite(edges), _finite(light))
 
 
 def _finite(x: mi.Float) -> mi.Float:
@@ -59,16 +59,16 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
     return dr.select(observer.separates(a, b), OWN, mi.Float(1))
 
 
-def radiance_of(worths: list[Worth]) -> mi.Float:
+def radiance_of(importances: list[Importance]) -> mi.Float:
     """Estimate the mean radiance seen by arcs: scattered emitter light, divided by the arcs' scattering weights."""
-    from_emitters, total = (dr.sum(worth.light) for worth in worths)
+    from_emitters, total = (dr.sum(importance.light) for importance in importances)
     return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
 
 
-def weighed(worths: list[Worth], radiance: mi.Float) -> list[mi.Float]:
+def weighed(importances: list[Importance], radiance: mi.Float) -> list[mi.Float]:
     """Concatenate presence and importance of the edges on both kinds of segments; normalise each to sum to 1."""
-    in_squares, on_arcs = worths
+    in_squares, on_arcs = importances
     presence = dr.concat([in_squares.presence, on_arcs.presence])
-    worth = dr.concat([in_squares.edges, radiance * on_arcs.edges])
-    dr.eval(presence, worth)
-    return [x / dr.maximum(dr.sum(x), dr.smallest(mi.Float)) for x in (presence, worth)]
+    importance = dr.concat([in_squares.edges, radiance * on_arcs.edges])
+    dr.eval(presence, importance)
+    return [x / dr.maximum(dr.sum(x), dr.smallest(mi.Float)) for x in (presence, importance)]
