@@ -11,11 +11,11 @@ probability of reflection is F, as in Mitsuba, with one exception. For rays from
 angle, transmission is sampled with a probability of at least 1/4. Near the critical angle dF is unbounded, and samples
 with the small probability 1 - F would contribute nearly all of the derivative.
 
-Differentiated: wo and the weight with respect to `eta` and si.wi, and the weight with respect to the tints. *Not*
-differentiated: the probability of choosing a lobe, and the onset of total internal reflection. bs.pdf is detached, and
-the weight is f / detach(pdf). The value of the weight is therefore the tint (times s), while its derivative contains
-the Fresnel term. F is continuous at the onset of total internal reflection. If an edge of the scene is seen through a
-lobe, its motion is a boundary term, which belongs to the integrator.
+The direction wo and the weight are differentiated with respect to `eta` and si.wi. The weight is also differentiated
+with respect to the tints. The probability of choosing a lobe and the onset of total internal reflection are *not*
+differentiated (F is continuous at the onset). bs.pdf is detached, and the weight is f / detach(pdf). The value of the
+weight is therefore the tint (times s), while its derivative contains the Fresnel term. If an edge of the scene is seen
+through a lobe, the motion of the edge is a boundary term, which belongs to the integrator.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class DielectricAD:
                 cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        dr.make_opaque(self.eta)  # otherwise a kernel constant: every update would recompile the kernel
+        dr.make_opaque(self.eta)  # a literal is a kernel constant: every update would recompile the kernel
 
     def to_string(self) -> str:
         lines = [f"  eta = {self.eta},"]

@@ -7,9 +7,9 @@ With V, A and Q the volumes `sigma_t`, `albedo` and `emission`, and s the `scale
 Mitsuba's integrators use a global majorant and ignore the emission. The integrators of this package call `free_flight`
 (local majorants), `transmittance` (residual ratio tracking) and `emission_at`.
 
-The coefficients and the emission are differentiable with respect to V, A, Q, s and the position. *Not* differentiated:
-majorants, free-flight distances and the transmittance estimate (all detached), the bounding box and `to_world` of
-volumes.
+The coefficients and the emission are differentiable with respect to V, A, Q, s and the position. Majorants, free-flight
+distances and the transmittance estimate are detached. The bounding box and the `to_world` of volumes are *not*
+differentiated.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from pathreplay.plugins.supergrid import (
     voxel_bounds,
 )
 
-#: Half the side of the cube that a density given as a number fills. The value is larger than any scene, and far from
-#: overflow. Without a transform, a `constvolume` fills only the unit cube.
+#: Half the side of the cube that a `constvolume` fills if the density is given as a number. The value is larger than
+#: any scene, and far from overflow. Without a transform, a `constvolume` fills only the unit cube.
 FAR = 1e6
 
 
@@ -72,7 +72,7 @@ class GridMedium:
     def parameters_changed(self, keys: list[str]) -> None:
         if keys and "sigma_t" not in keys and "scale" not in keys:
             return
-        dr.make_opaque(self.scale)  # otherwise a kernel constant: every update would recompile the kernel
+        dr.make_opaque(self.scale)  # a literal is a kernel constant: every update would recompile the kernel
         with dr.suspend_grad():
             if not keys or "sigma_t" in keys:
                 self.box = self.sigma_t.bbox()
@@ -97,7 +97,7 @@ class GridMedium:
         dr.make_opaque(self.majorant)
 
     def _cheapest_cells(self, values: Sequence[tuple[mi.Float, ...]]) -> grid_traversal.Cells:
-        """Return the cells of the cheapest level. Each level has a tuple in ``values``, which ends with the collision rate."""
+        """Return the cells of the cheapest level. ``values`` has a tuple per level, whose last entry is the rate."""
         rates = [dr.mean(numbers[-1]) for numbers in values]
         dr.eval(values, rates)
         last = len(values) - 1

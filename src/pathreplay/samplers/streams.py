@@ -1,12 +1,12 @@
 """Streams: named, disjoint sequences of the counter-based samplers, one per purpose.
 
-Comments in `Stream` state how the value of a stream is used:
+The value of a stream is used in one of four ways, as the comments in `Stream` state:
 
-- combined with a seed or key, by exclusive or (`Stream.of`) or by a hash,
-- as the first index of the stream in the sequence of a key (`CounterSampler.stream`), where the indices from 0 on
-  belong to the path itself, with six samples per vertex (see `CounterSampler.at_vertex`),
-- added to the state of a generator, or
-- hashed into the key of a Sobol sampler.
+- It is combined with a seed or key, by exclusive or (`Stream.of`) or by a hash.
+- It is the first index of the stream in the sequence of a key (`CounterSampler.stream`). The lowest indices, from 0 on,
+  belong to the path itself, with six samples per vertex (see `CounterSampler.at_vertex`).
+- It is added to the state of a generator.
+- It is hashed into the key of a Sobol sampler.
 """
 
 from __future__ import annotations

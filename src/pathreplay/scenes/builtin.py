@@ -315,8 +315,8 @@ def _cumulus(size: int) -> np.ndarray:
     """Return the extinction of a cloud at the voxel centres of [-1, 1]³, as an array of shape (z, y, x, 1).
 
     The extinction is max(0, 8 b(y) Σ_i exp(-|x - c_i|² / r_i²) (0.75 + n(x)) - 1.5). The sum is over six Gaussian
-    blobs. The factor b cuts off their lower part, so that the base is flat. The noise n is a sum of 12 plane waves with
-    wavelengths from 0.5 to 1.2.
+    blobs. The factor b cuts off the lower part of the blobs, so that the base is flat. The noise n is a sum of 12 plane
+    waves with wavelengths from 0.5 to 1.2.
     """
     z, y, x = (2 * centres - 1 for centres in _centres(size, size, size))
     shape = np.zeros_like(x)
@@ -336,7 +336,7 @@ def _cumulus(size: int) -> np.ndarray:
 
 
 def _sky(rows: int) -> np.ndarray:
-    """Return a sky, blue above and dim below. The sun (elevation 50 degrees) is blurred over 8 degrees."""
+    """Return a sky, blue above and dim below. The sun, 50 degrees high, is blurred over 8 degrees, so paths hit it."""
     v, u = _centres(rows, 2 * rows)
     θ, φ = np.pi * v, 2 * np.pi * u
     d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)  # as in Mitsuba's envmap

@@ -32,7 +32,7 @@ class _Element:
         return [kinds[0] for kinds in self.properties]
 
     def layout(self, form: str) -> np.dtype[np.void]:
-        """Return the NumPy type of an entry. A list has three items. Numbers from text files have double precision."""
+        """Return the NumPy type of an entry. Lists must have three items. Numbers from text files become float64."""
         order = "<" if form == "binary_little_endian" else ">"
         fields: list[tuple[str, str] | tuple[str, str, int]] = []
         for i, (*kinds, _) in enumerate(self.properties):
@@ -81,7 +81,7 @@ def _ply_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
 
 
 def _triangles(file: BinaryIO, elements: list[_Element], form: str) -> np.ndarray | None:
-    """Read the vertex indices (n, 3). Return None if Mitsuba rejects the file: missing data, or other polygons."""
+    """Read the vertex indices (n, 3). Return None for missing data or other polygons: Mitsuba rejects both."""
     vertex, face = (element.layout(form) for element in elements[:2])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy warns if text follows the numbers

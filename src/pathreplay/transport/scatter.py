@@ -32,8 +32,8 @@ from pathreplay.transport.vertex import (
 SAME_LOBE = 1e-3
 
 # A lobe counts as narrow if its density at the centre is larger than that of a diffuse lobe. The noise of a detached
-# lobe is proportional to the slope of the log density, the noise of an attached lobe to the slope of the radiance.
-# docs/gradients.md lists the variances for different roughnesses.
+# lobe is proportional to the slope of the log density. The noise of an attached lobe is proportional to the slope of
+# the radiance. docs/gradients.md lists the variances for different roughnesses.
 NARROW = 1 / dr.pi
 
 
@@ -165,7 +165,7 @@ def _at_surface(
 def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
     """Return the lanes with narrow lobes, in which smooth continuations have a fixed direction.
 
-    If the direction pointed to a moving hit point, the value of the lobe would change with the direction. In a narrow
+    If the direction followed a moving hit point, the value of the lobe would change with the direction. In a narrow
     lobe, this derivative is large and noisy. Edges move across a fixed direction, which is therefore used only if
     boundary terms are estimated. The choice depends on vertex and incident ray only, so that all directions sampled at
     a vertex move in the same way.
@@ -179,8 +179,8 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
 def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
     """Return the lanes whose hit surface passes part of the light unscattered. These lanes have a fixed direction.
 
-    A direction that follows the motion of such a surface moves across the surfaces behind, and across their edges. With
-    a fixed direction, the outline of the transparent surface needs a boundary term instead. All lanes are therefore
+    A direction that followed the motion of such a surface would move across the surfaces behind, and across their
+    edges. With a fixed direction, the outline of the transparent surface needs a boundary term. All lanes are therefore
     False unless boundary terms are estimated.
     """
     if not (trace.may_slide and trace.traits.veils):

@@ -170,7 +170,7 @@ class Flight:
 
 @dataclass
 class NullCollision:
-    """The null collision of a flight that weighted reservoir sampling selected, for `null_branching`.
+    """The null collision that weighted reservoir sampling selected on a flight, for `null_branching`.
 
     Each null collision has a resampling weight m and is selected with probability m / ``mass``.
     """
