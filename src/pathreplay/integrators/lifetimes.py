@@ -42,7 +42,7 @@ class _Entry(Generic[T]):
 
     scene: mi.Scene
     about: T
-    held_once: object = field(default_factory=object)  # has the reference count of a scene without other references
+    held_once: object = field(default_factory=object)  # an object that only this entry references
 
     @property
     def is_unreferenced(self) -> bool:
