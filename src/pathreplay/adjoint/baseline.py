@@ -3,8 +3,8 @@
 Two averages are kept for each cell of position and direction. X is the mean radiance along rays with a real collision
 in the cell, and Y along rays that pass through the cell. With p the probability of a real collision, the baseline is
 b = (1 - p) X + p Y. Only earlier passes contribute to b, which is therefore independent of the current pass. The
-control variate of `fly_again` then has mean zero for any b that is zero where no collision evaluates it. A poor
-estimate increases noise and causes no bias. Nothing in this module is differentiated.
+control variate of `fly_again` then has mean zero for any b, provided that b is zero where neither real nor kept null
+collisions occur. A poor estimate increases noise and causes no bias. Nothing in this module is differentiated.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """
     if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False
-    if not trace.scene.shapes():  # no virtual function of a BSDF would be traced
+    if not trace.scene.shapes():  # without shapes, no virtual function of a BSDF is traced
         return False
     at = PathState.begin(trace, start).at
     return not path_moves(trace, start, at) and not weights_vary(trace, at)

@@ -60,7 +60,7 @@ class Crease:
         return exists if self.shadow is None else exists | self.shadow.exists
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        """Evaluate B, which is zero on the edge, and in lanes without an edge. Differentiable in ray and shapes."""
+        """Evaluate B, which is zero on the edge and in lanes without an edge. Differentiable in ray and shapes."""
         meets, turns = active & self.meets, active & self.turns
         t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, meets).t for hit in (self.a, self.b)]
         si = self.a.compute_surface_interaction(ray, mi.RayFlags.All, turns)
@@ -92,7 +92,7 @@ def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> 
 
 
 def _towards(trace: TraceConfig, at: Arrival, p: mi.Point3f, short: mi.Float, active: mi.Bool) -> Arrival:
-    """Move an arrival to the point ``p``, unless a ray towards p hits another surface beyond ``short`` before p."""
+    """Move an arrival to the nearby point ``p``, if a ray that starts ``short`` before p hits the same surface."""
     ray, to_p = mi.Ray3f(at.ray), p - at.ray.o
     ray.d = dr.normalize(to_p)
     offset = dr.maximum(dr.norm(to_p) - short, 0)

@@ -6,8 +6,8 @@ crossings with edges is 2 l / π times the integral of g along the edges. Differ
 indicate a crossing; bisection locates it.
 
 If a segment has two crossings, for example at a corner, its ends are equal. Segments with equal ends are therefore also
-probed in the middle. If the part between the two crossings does not cover the middle, it is still missed. Segments of
-which only the middle differs therefore have a larger weight: see `middle_weight`.
+probed in the middle. Two crossings on the same side of the middle are still missed. Segments of which only the middle
+differs therefore have a larger weight: see `middle_weight`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CRACK_BISECTIONS = 8
 PARTS = 3
 """Number of bisections in each half of a segment that locate the end of the differing part."""
 MIN_FRACTION = 9 / 32
-"""Fraction below which `middle_weight` is constant. It lies halfway between two values that `middle_fraction` takes."""
+"""Fraction below which `middle_weight` is constant: the mean of two adjacent results of `middle_fraction`."""
 BEYOND = 1.5
 """Distance beyond the fixed end at which a suspected crack is probed, in lengths of the final interval. In the square
 of an emitter this distance is less than `emitters.BORDER`."""
@@ -160,7 +160,7 @@ class Survey:
         """Summarise the probes at `probe_positions`."""
         a, b, c = probes
         ends, halves = a.edge_importance(b), dr.maximum(c.edge_importance(a), c.edge_importance(b))
-        # If only the middle differs, one of two crossings is selected, and `middle_weight` applies: in all, about 4.
+        # If only the middle differs, the weight is about 4: one of two crossings is selected, see `middle_weight`.
         presence = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
         near = dr.maximum(dr.maximum(a.near, b.near), c.near)
         bright = dr.maximum(dr.maximum(a.bright, b.bright), c.bright)
@@ -194,7 +194,7 @@ def middle_fraction(
 ) -> mi.Float:
     """Return the fraction of a segment, around its middle, that differs from its ends; each half is exact to 1/16.
 
-    A position belongs to this part if its probe differs from the probe at one end. The part may contain further edges.
+    A position belongs to this part if its probe differs from the probe at an end. The part may contain further edges.
     """
     half = 0.5 * length
     n, fraction, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
@@ -215,8 +215,8 @@ def middle_fraction(
 def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32) -> Bracket:
     """Bisect each segment of non-zero ``weight`` to an interval with an edge, 2^-12 as long as the segment.
 
-    If a segment has several crossings, one is selected in proportion to the importance of an edge, and its weight is
-    divided by the selection probability. If only the middle differs, `middle_weight` applies. The weight becomes 0
+    If a segment has several crossings, one is selected with a probability proportional to its importance, and the
+    weight is divided by this probability. If only the middle differs, `middle_weight` applies. The weight becomes 0
     where a surface is merely curved, and at cracks between triangles, through which few rays pass. A crack is assumed
     if one end of the interval stays fixed, and a probe just beyond this end equals the probe at the other end.
     """

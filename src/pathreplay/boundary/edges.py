@@ -1,7 +1,7 @@
 """Edges: derivatives due to the motion of edges, propagated along the camera paths that see the edges.
 
-An edge is the zero set of a function B(ray, π), and moves with dB/dπ. The edge contributes to the derivative of the
-radiance at film position s
+An edge is the zero set of a function B(ray, π), and moves with dB/dπ. The contribution of the edge to the derivative of
+the radiance at film position s is
 
     - Σ K dB/dπ,
 
@@ -90,7 +90,7 @@ class Edges:
     observer: ObserverVertex | None  # the vertex that sees the edge; None for edges on the film
 
     def motion(self, ray: mi.Ray3f) -> mi.Spectrum:
-        """Evaluate - Σ K B (Spectrum), differentiable in the last ``ray`` of the path and in the shapes."""
+        """Evaluate - Σ K B over all crossings (Spectrum). Differentiable in the path's last ``ray`` and the shapes."""
         at = ray if self.observer is None else self.observer.moved(ray)
         return -reduce(add, [crossing.weight * crossing.gap(at) for crossing in self.crossings])
 

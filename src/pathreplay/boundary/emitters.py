@@ -180,7 +180,7 @@ class EmitterSegment(PlaneSegment):
     def followed(self, origin: mi.Interaction3f, u: mi.Point2f, anchor: EmitterProbe, active: mi.Bool) -> mi.Vector3f:
         """Return the direction to position ``u`` of the emitter, differentiable in ``u``, origin and emitter.
 
-        On a mesh emitter, the derivatives are those of the direction to the point that the ray of ``anchor`` hit.
+        On a mesh emitter, the direction moves with the origin and the point that the ray of ``anchor`` hit.
         """
         trace, emitter = self.observer.trace, self.emitter
         in_cone = active & (emitter.radius > 0)
@@ -202,7 +202,7 @@ class EmitterSegment(PlaneSegment):
         return VisibilityProbe.of(sample.hidden & moving)
 
     def detect(self) -> Importance:
-        """Estimate the importance of an edge. Without narrow lobes, scattering is evaluated only at the middle."""
+        """Estimate the importance of an edge. Without narrow lobes, only the segment's middle evaluates scattering."""
         trace, x, active = self.observer.trace, self.observer.selected, self.observer.active
         samples = [self.probe_emitter(t, active) for t in probe_positions(self.length)]
         a, b, c = (sample.light.d for sample in samples)
@@ -267,7 +267,7 @@ class ShadowCrossing:
         return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, dark.hit, dark.ray, self.active))
 
     def weighted(self, w: mi.Vector2f, u_lit: mi.Point2f) -> ShadowCrossing:
-        """Replace the weight, the jump in direction ``w``, by K; ``u_lit`` is the emitter sample on the lit side."""
+        """Replace the weight, the jump along ``w``, by its `crossing_weight`. ``u_lit`` is the end on the lit side."""
         observer, dark = self.segment.observer, self.dark
         at = observer.moved(observer.at.ray)
         slope = derivative_by_place(self.u, lambda u: self._gap(at, u))

@@ -185,7 +185,7 @@ class OcclusionEdge:
 
 @dataclass
 class HeldEdge:
-    """The motion of an occluder's edge: the direction d follows the point of the near surface. See `Crossing`."""
+    """The motion of an occluder's edge: the direction d to the edge follows the near surface. See `Crossing`."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge

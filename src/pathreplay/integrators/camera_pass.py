@@ -128,11 +128,12 @@ class Pass:
     ) -> OwenSobolSampler:
         """Create the Sobol sampler of path number ``path`` of a pixel that has ``paths`` paths.
 
-        ``pixel`` is a row-major index in a film ``width`` pixels wide. Each ``of`` selects an independent Sobol set.
+        ``pixel`` is a row-major index in a film of ``width`` pixels. Each value of ``of`` selects an independent set of
+        samples.
         """
         bits = (paths - 1).bit_length()
         morton = morton_index(pixel % width, pixel // width)
-        # If the index needs more than 32 bits, its leading bits select the Sobol set together with ``of``.
+        # If the index needs more than 32 bits, its leading bits and ``of`` together select the set of samples.
         overflow = morton >> (32 - bits) if bits else mi.UInt32(0)
         return OwenSobolSampler.of((morton << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), overflow))
 

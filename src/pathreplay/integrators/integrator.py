@@ -97,8 +97,7 @@ class PathReplayIntegrator(PathIntegrator):
     Gradients of media use a control variate that this integrator learns from earlier gradient passes with other seeds.
     ``null_branching`` traces one more path from a null collision, as if the medium had scattered there. Without null
     branching, the gradient with respect to extinction is wrong where extinction is zero. ``auto`` branches if
-    extinction with gradients varies in space or is zero. If it varies or is zero, branching usually also takes less
-    time at equal noise.
+    extinction with gradients varies in space or is zero. Branching then usually takes less time at equal noise, too.
 
     Not differentiated: visibility that ``boundary`` leaves out; with ``attach='none'``, all motion of shapes, cameras
     and directions; without ``null_branching``, extinction where it is zero; with ``adjoint='replay'``, weights that are

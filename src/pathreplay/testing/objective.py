@@ -151,7 +151,7 @@ class Objective:
         return float(dr.grad(t)[0])
 
     def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
-        """Judge gradients by finite differences along the line: ``full`` with the line's step, ``half`` with half."""
+        """Judge gradients by finite differences: ``full`` with the step of the line, ``half`` with half this step."""
         # Worst case: rounding errors of half a unit in the last place of every image, all of the same sign.
         unit = np.finfo(get_array(self.value).dtype).eps / 2
         rounding = line.stencil.rounding() * unit * self.scale / line.step

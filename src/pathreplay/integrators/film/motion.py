@@ -5,7 +5,8 @@ With the filter h_j of pixel j, restricted to the film D, and the velocity v of 
     dI_j/dπ = 1/∫_D h_j · ( ∫_D div(h_j v) L ds - ∮_∂D h_j L v·n dl ).
 
 Filters are products h_j = f(x) f(y), and f(x) jumps to zero at the border of the film. The derivative of f is therefore
-a measure df(x): the slope of f inside the film, and the jump as a point mass at the border. The three integrals are
+a measure df(x): the slope of f inside the film, and the jump as a point mass at the border. The derivative of I_j
+consists of the three integrals
 
     ∫ f(y) dy ∫ v_x L df(x),        ∫ f(x) dx ∫ v_y L df(y),        ∫_D h_j (∂v_x/∂x + ∂v_y/∂y) L ds.
 
@@ -49,9 +50,9 @@ from pathreplay.transport.vertex import TraceConfig
 GROUP = 5
 """Number of paths with the same random numbers: right and left, above and below, and one for the divergence."""
 BLUR, MOST = 16, 16
-"""The local mean of the adjoint includes 1 / BLUR of the film's shorter side to each side, at most MOST pixels.
-
-If the adjoint is smooth over this length, the noise of the local mean's part falls with the third power of it."""
+"""The local mean of the adjoint is taken over a square. From a pixel to each side, the square extends over 1 / BLUR of
+the film's shorter side, but at most MOST pixels. The noise of the term that contains the local mean falls with the
+third power of this length, if the adjoint is smooth over the square."""
 
 
 @dataclass
@@ -61,7 +62,7 @@ class FlowPaths:
     pixel: mi.UInt32  # row-major index
     sample: Sample  # sample of the camera ray
     axis: mi.UInt32  # axis along which the two positions of a pair differ
-    single: mi.Bool  # the path is the only one of its group for the divergence
+    single: mi.Bool  # whether the path estimates the divergence and belongs to no pair
     offset: mi.Float  # distance of a path of a pair from the pixel centre, along the axis
     derivative: FilterSamples  # sampler of the offsets: the derivative of the filter
     L: mi.Spectrum  # weighted radiance, to be multiplied by the velocity or the divergence
@@ -107,7 +108,7 @@ class FilmMotion:
         return ""
 
     def _flow_factor(self, view: Pass, f: FlowPaths) -> mi.Float:
-        """Return one factor per path: for a pair, the velocity along its axis in pixels; otherwise, the divergence."""
+        """Return one factor per path: the velocity along the axis of its pair, in pixels, or else the divergence."""
         v = self.flow.velocity(f.sample) * mi.Vector2f(*view.size)
         return dr.select(f.single, self.flow.divergence(f.sample), dr.select(f.axis == 0, v.x, v.y))
 
