@@ -44,7 +44,7 @@ class NonFiniteCounter:
         self.count = dr.zeros(mi.UInt32, 1)
 
     def add(self, lost: mi.Bool) -> None:
-        """Count lanes from inside a loop.
+        """Count the lanes in which ``lost`` is true, from inside a loop.
 
         The count is a side effect of the loop, like gradients. A mask returned from the loop would be evaluated
         separately, and the whole kernel would run again.
@@ -69,10 +69,11 @@ def backward_step(
     active: mi.Bool,
     rays_only: bool = False,
 ) -> tuple[mi.Spectrum, RayDerivative, mi.Bool]:
-    """Back-propagate  δL β_i·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; return L_i and q_i.
+    """Back-propagate  δL β_i·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; return L_i, q_i and a mask.
 
-    ``L`` is L_{i+1}. If not ``attached``, q is zero and is not computed. A non-finite q_i is set to zero, and the last
-    result is the mask of these lanes. With ``rays_only``, no parameter receives a gradient.
+    ``L`` and ``q`` are L_{i+1} and q_{i+1}, the radiance along the next ray r_{i+1} and the adjoint of this ray. Unless
+    ``attached``, ray adjoints are zero and are not computed. The mask contains the lanes in which q_i was not finite
+    and was set to zero. With ``rays_only``, no parameter receives a gradient.
     """
     lost = mi.Bool(False)
     with dr.resume_grad():
@@ -94,7 +95,7 @@ def backward_step(
 def forward_step(
     trace: TraceConfig, v: VertexRecord, attached: bool, tangent: RayDerivative, active: mi.Bool
 ) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative]:
-    """Evaluate a step again; return it with the tangents of e_i, of w_i and of the next arrival."""
+    """Evaluate step i again; return it with the tangents of its emission e_i, its weight w_i and the next arrival."""
     with dr.resume_grad():
         at = v.at
         if attached:
@@ -153,7 +154,7 @@ def _attached_ray(ray: mi.Ray3f) -> mi.Ray3f:
 
 
 def tangents(*values: Any) -> list[Any]:
-    """Forward-propagate from the parameters to all values at once; tangents of unreached values are zero."""
+    """Forward-propagate from the parameters to all values in one traversal; values without gradients get zero."""
     attached = [value for value in values if dr.grad_enabled(value)]
     if not attached:
         return [dr.zeros(type(value)) for value in values]
@@ -169,6 +170,6 @@ def backward(target: mi.Float) -> None:
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):
-            return  # if calls are evaluated, other paths or vertices may still reach a parameter
+            return  # Loops and calls are evaluated step by step: another step may still depend on a parameter.
         raise Unreached("no parameter with gradients reaches the light paths")
     dr.backward_from(target)

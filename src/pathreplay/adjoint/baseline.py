@@ -1,10 +1,10 @@
 """The learned baseline of volume gradients: an estimate of the radiance that arrives at a point of a medium.
 
-The estimate uses two averages over cells of position and direction: X, of the radiance scattered at real collisions,
-and Y, of the radiance transmitted where rays continue. With p the probability of a real collision, the baseline is b =
-(1 - p) X + p Y. Only earlier passes contribute to b. It is therefore independent of the current pass, and the control
-variate of `fly_again` has mean zero for any b. This requires that real collisions and, if they are kept, null
-collisions evaluate b everywhere. A poor estimate increases noise and causes no bias. Nothing here is differentiated.
+Two averages are kept for each cell of position and direction. X is the mean radiance along rays with a real collision
+in the cell, and Y along rays that pass through the cell. With p the probability of a real collision, the baseline is
+b = (1 - p) X + p Y. Only earlier passes contribute to b, which is therefore independent of the current pass. The
+control variate of `fly_again` then has mean zero for any b, provided that b is zero where neither real nor kept null
+collisions occur. A poor estimate increases noise and causes no bias. Nothing in this module is differentiated.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ CELLS, SIDES = 8, 4
 AVERAGES = 2 * CELLS**3 * SIDES**2  # X and Y side by side
 # Factor by which the previous sums are multiplied when a pass is added. About the last ten passes contribute.
 MEMORY = 0.9
-# Initial weight c of null collisions (see `branch_weight`), which corresponds to fifty null collisions per path.
+# Initial relative weight c of null collisions (see `branch_weight`): the inverse of fifty null collisions per path.
 FIRST_BRANCHING = 0.02
 # Number of partial sums over which the numbers of null collisions are distributed.
 SLOTS = 256
-# The mean over all cells contributes to the average of a cell like this number of samples of the cell.
+# Weight of the mean over all cells in the average of one cell, as a number of samples of this cell.
 PRIOR = 2.0
 
 
@@ -53,7 +53,7 @@ class BaselineCells:
         return BaselineCells(tuple(map(float, box.min)), tuple(scale))
 
     def index(self, p: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
-        """Return the index of the first average of a cell."""
+        """Return the index of the average X of a cell; the average Y follows it."""
         at = mi.Vector3u(
             dr.clip(mi.Vector3f(p - mi.ScalarPoint3f(self.low)) * mi.ScalarVector3f(self.scale), 0, CELLS - 1)
         )
@@ -77,7 +77,7 @@ class BaselineStats:
 
     @staticmethod
     def none(cells: BaselineCells, *keys: Hashable) -> BaselineStats:
-        """Create empty statistics for passes with these keys; a recorded pass has no key."""
+        """Create empty statistics for the passes that the keys identify; a recorded pass has no key."""
         sums, nulls = dr.zeros(mi.Float, 4 * AVERAGES), dr.zeros(mi.Float, SLOTS)
         dr.make_opaque(sums, nulls)
         return BaselineStats(cells, sums, nulls, 0, frozenset(keys))
@@ -98,7 +98,7 @@ class BaselineStats:
         x = interaction(at.medium, at.ray, flight.t)
         y = interaction(at.medium, at.ray, a + flight.along * length)
         self._add(self.cells.index(x.p, at.ray.d), L, mi.Float(1), event)
-        # y is sampled with density 1 / length. The weight, the length in mean free paths, compensates for this density.
+        # The point y is uniform on the flight. Its density, 1 / length, is compensated by the weight length · majorant.
         weight = length * majorant(at.medium, at.ray, length > 0)
         self._add(self.cells.index(y.p, at.ray.d) + 1, L, weight, length > 0)
 

@@ -1,4 +1,4 @@
-"""The driver interface: a driver differentiates the light paths that begin at a start."""
+"""The driver interface: a driver differentiates the light paths that begin at the rays of a `CameraStart`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from pathreplay.transport.vertex import TraceConfig
 class Driver(Protocol):
     """Back-propagates the adjoint radiance ``δL`` of each path into the parameters and into the ``start``.
 
-    Returns whether the paths move with the parameters. ``lost`` counts paths that lost a part of their gradient. The
-    caller suspends gradients (`dr.suspend_grad`). Each driver documents what it does not differentiate.
+    Returns whether the paths move, i.e. whether their vertices or directions depend on parameters with gradients.
+    ``lost`` counts paths that lost a part of their gradient. The caller suspends gradients (`dr.suspend_grad`). Each
+    driver documents what it does not differentiate.
     """
 
     def __call__(self, trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool: ...

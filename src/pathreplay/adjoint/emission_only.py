@@ -24,12 +24,12 @@ from pathreplay.transport.vertex import TraceConfig
 def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """Return whether only emitted radiance has gradients: no weight depends on a parameter, and nothing moves.
 
-    Returns False in scenes with media. The test traces a step symbolically, which reaches all objects. It returns False
-    if Dr.Jit evaluates virtual calls immediately, because the first vertices may then not reach all objects.
+    Tracing one step symbolically includes the virtual functions of all objects. If Dr.Jit evaluates virtual calls
+    immediately, the first vertices may miss some objects, and the result is False. It is also False with media.
     """
     if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False
-    if not trace.scene.shapes():  # without surfaces, the test would trace no BSDF
+    if not trace.scene.shapes():  # without shapes, no virtual function of a BSDF is traced
         return False
     at = PathState.begin(trace, start).at
     return not path_moves(trace, start, at) and not weights_vary(trace, at)

@@ -34,7 +34,7 @@ class Branch:
     mass: mi.Float  # sum of the resampling weights of all null collisions so far
     number: mi.Float  # number of null collisions so far
     depth: mi.UInt32  # number of vertices before the collision
-    η: mi.Float  # relative index of refraction since the camera
+    η: mi.Float  # product of the relative indices of refraction along the path
 
     @staticmethod
     def none() -> Branch:
@@ -42,7 +42,7 @@ class Branch:
         return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, mi.Float(0), mi.Float(0), mi.UInt32(0), mi.Float(1))
 
     def offer(self, path: PathState, step: SampledStep) -> Branch:
-        """Add a flight's null collision to the reservoir; its selection probability is proportional to its mass."""
+        """Offer a flight's null collision to the reservoir, with the resampling weight `NullCollision.mass`."""
         ray, null = path.at.ray, step.kept.media.flight.null
         active = path.active & dr.any(path.β != 0)
         mass = self.mass + dr.select(active, null.mass, 0)

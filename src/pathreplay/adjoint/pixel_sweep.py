@@ -9,10 +9,9 @@ sets S, and the adjoint of each path uses only the other sets:
 
     δL_s = f'(I_{-S}) / N,    I_{-S} = (N I - Σ_S L) / (N - |S|),    f'(I) = offset + slope · I.
 
-The expected gradient is the same as with an independent image, but the variance is not. First, f'(I) dL_s is correlated
-with the change of f' due to L_s. This lowers the variance where the loss demands more light, and raises it where the
-loss demands less. Second, a term of second order in 1/N is added: the product of the noise of the image and the noise
-of the derivative.
+The expected gradient is the same as with an independent image, but the variance is not. First, the noise of the image
+and the noise of its derivative are correlated. The correlation lowers the variance where the loss demands more light,
+and raises it where the loss demands less. Second, the product of these two noises adds a term of second order in 1/N.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ def pixel_sweep(
         layout = Layout.of(trace, path_moves(trace, start, PathState.begin(trace, start).at))
     records = dr.alloc_local(record_type(layout), paths * room)
     counts = dr.alloc_local(mi.UInt32, paths)  # number of records of each path
-    ends = dr.alloc_local(mi.Spectrum, paths)  # radiance from beyond the records of each path
+    ends = dr.alloc_local(mi.Spectrum, paths)  # radiance along the ray that leaves the last recorded vertex
     sets = dr.alloc_local(mi.Spectrum, -(-paths // size), dr.zeros(mi.Spectrum))  # sum of radiances of each set
     s = mi.UInt32(0)  # index of the path
 

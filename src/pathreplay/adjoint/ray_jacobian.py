@@ -22,19 +22,19 @@ from pathreplay.transport.path import PathState
 from pathreplay.transport.step import repeat_step
 from pathreplay.transport.vertex import Arrival, TraceConfig, VertexRecord, VertexSamples, reciprocal
 
-# Noise is added where `independence` is below this value. For smooth lobes that follow their hit point, independence is
-# zero up to float32 rounding (1e-7). For mirrors, glass and attached rough metal, independence is above 1e-3. In
+# Noise is added where `independence` is below this value. Independence is zero up to float32 rounding (1e-7) for smooth
+# lobes whose direction follows the next hit point, and above 1e-3 for mirrors, glass and attached rough metal. In
 # float64, matrices with an independence of 1e-4 can be inverted accurately.
 ILL_CONDITIONED = 1e-4
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """How ray adjoints are recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i, in float64.
+    """How the adjoint q_{i+1} of the next ray is recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i, in float64.
 
-    ``noise`` is the standard deviation of ε_i, which is +noise or -noise with equal probability. Of all distributions
-    with mean zero and this variance, this distribution has the largest distance from zero, where the matrix is
-    singular. 0 turns the noise off. Where A_i is ill-conditioned, X_i is the identity on directions and zero on
+    See `replay_attached` for A_i and p_i. The random number ε_i is +noise or -noise with equal probability. These two
+    values are as far from zero, where the matrix is singular, as the standard deviation ``noise`` permits. The value 0
+    of ``noise`` turns the noise off. Where A_i is ill-conditioned, X_i is the identity on directions and zero on
     origins. Elsewhere, X_i is zero.
     """
 
@@ -76,10 +76,10 @@ class RayFrame:
 
 @dataclass
 class Slope:
-    """Derivatives of δL·β e of a vertex with respect to properties of its arrival that its ray does not determine."""
+    """Derivatives of δL·β e at a vertex with respect to two inputs that the arriving ray does not determine."""
 
     pdf: mi.Float  # density of the ray
-    slide: mi.Float  # distance by which the origin moves forward along the ray
+    slide: mi.Float  # distance by which the origin of the ray moves along the ray
 
 
 @dataclass
@@ -116,7 +116,7 @@ def length_scale(scene: mi.Scene) -> float:
 
 
 def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
-    """Differentiate weight·e (detached weight) with respect to density, and motion of the origin along the ray."""
+    """Differentiate weight·e, at constant weight, with respect to the two fields of `Slope`."""
     if not has_smooth_lobes(trace):
         return Slope(mi.Float(0), mi.Float(0))
     slopes = []
@@ -143,10 +143,10 @@ def local_terms(
     frame_next: RayFrame,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Spectrum, list[mi.Float]]:
-    """Evaluate the step at ``v`` with a differentiable arrival; return the terms of which its adjoint consists.
+    """Evaluate the step at ``v`` with a differentiable arrival; return three terms that both passes differentiate.
 
-    The terms are δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), w_i/detach(w_i) (0 where w_i is 0), and the four
-    coordinates of the next ray. ``weight`` is δL β_i, and ``slope`` belongs to the next vertex.
+    The first term is δL·β_i e_i + (slope of e_{i+1})·(pdf, slide). The second is w_i/detach(w_i), or 0 where w_i is 0.
+    The third consists of the four coordinates of the next ray. ``weight`` is δL β_i; ``slope`` is the slope of e_{i+1}.
     """
     step = repeat_step(trace, replace(v, at=at), True, active)
     o, d = step.ray_next.o, step.ray_next.d

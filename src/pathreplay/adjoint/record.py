@@ -52,7 +52,7 @@ def deepest(trace: TraceConfig, device: Device | None = None) -> int:
 
 
 def largest_record(trace: TraceConfig) -> int:
-    """Return the size in bytes of the larger record: static paths record radiance, moving paths random numbers."""
+    """Return the bytes per vertex of the larger layout: static paths record radiance, moving paths random numbers."""
     return max(_bytes(Layout.of(trace, moves)) for moves in (False, True))
 
 
@@ -62,7 +62,7 @@ def _bytes(layout: Layout) -> int:
 
 
 def room_for(trace: TraceConfig) -> int:
-    """Return the number of records per path. With media, two null boundaries per vertex (convex media) are added."""
+    """Return the number of records per path. With media, it includes two null boundaries per vertex (convex media)."""
     if trace.media is None:
         return device_of(mi.variant()).room(max(trace.max_depth, 1))
     return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)
@@ -76,7 +76,7 @@ class Layout:
     moves: bool  # the path moves with the parameters
     resamples: bool  # BSDFs are sampled again in later passes
     fixed: bool  # radiance from emitters is recorded as a value, and rays that leave the scene have no vertex
-    glows: bool  # fixed, and some emitter is a surface, so that emission at vertices is recorded
+    glows: bool  # emission at vertices is recorded: ``fixed`` is true, and some emitter is a surface
     media: bool
     chromatic: bool
     emissive: bool
@@ -167,7 +167,7 @@ def _require_known(place: str, remembered: str) -> None:
         raise TypeError(f"Layout has no '{remembered}', on which '{place}' depends")
 
 
-for _place, *_, _remembered in (*FIELDS, *BITS):  # after a rename, fail on import and not in a kernel
+for _place, *_, _remembered in (*FIELDS, *BITS):  # a name that no longer exists is reported on import
     _require_known(_place, _remembered)
 
 

@@ -6,7 +6,7 @@ The first pass stores L_0 and q_0 = δL·∂L_0/∂r_0. The second pass ("peelin
 
 where p_i = δL·∂(β_i e_i + β_i w_i L_{i+1})/∂r_i at fixed L_{i+1}. `Recovery` describes the noise ε_i X_i. The noise has
 mean zero, and the first pass uses the same A_i + ε_i X_i, so that the expectation of q_0 is unchanged. This is the
-attached estimator of Vicini, Speierer and Jakob (2021). The sweep driver, which needs no inverse, is compared with it.
+attached estimator of Vicini, Speierer and Jakob (2021). The sweep driver computes q without inverting a matrix.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def replay_attached(
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start`` of a ``path``.
 
     ``lost`` counts the paths on which some q was not finite and was dropped. The recovery is exact on chains of delta
-    lobes. At smooth lobes A_i has rank two. There, q cannot be recovered without noise, and is unbiased with noise,
-    unless amplified rounding errors exceed it. Not differentiated: visibility, and weights that are exactly zero.
+    lobes. At smooth lobes, A_i has rank two, and q can be recovered only with noise. The result is then unbiased,
+    unless amplified rounding errors exceed the noise. Not differentiated: visibility and weights that are exactly zero.
     """
     scale = length_scale(trace.scene)
     again = start.sampler.clone()
@@ -47,7 +47,7 @@ def replay_attached(
     with dr.resume_grad():
         o, d = start.repeat()
         if dr.grad_enabled(o, d):
-            dr.eval(q, L, overflow)  # without this, each entry of the camera matrix would run the first pass again
+            dr.eval(q, L, overflow)  # once: otherwise, each entry of the camera matrix runs the first pass
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
             backward(sum((q0[k] * x[k] for k in range(1, 4)), q0[0] * x[0]))

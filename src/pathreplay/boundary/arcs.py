@@ -1,15 +1,17 @@
 """Arcs of directions around a vertex, on which edges between surfaces are searched: see `crofton`.
 
-An arc contains a BSDF sample d, drawn with density p. If d were always its centre, the variance would be practically
-unbounded for lobes that are narrower than the arc: at the peak, f is many thousand times the density beside it. The
-sample d therefore lies at one of n positions of the arc, selected at random. The density of the arc is the mean of p
-over these positions d_i, which accounts for every lobe that is wider than their spacing. Narrower lobes need shorter
-arcs. A length l_j is selected with probability P_j(p), and a crossing in direction z has the weight
+An arc contains a BSDF sample d, drawn with density p. If d were always the centre of the arc, the variance would be
+practically unbounded for lobes that are narrower than the arc: scattering f at the peak of the lobe is many thousand
+times the density p beside the peak. The sample d therefore lies at one of n positions d_i of the arc, selected at
+random. The density of the arc is the mean of p(d_i), which accounts for all lobes that are wider than the spacing of
+the d_i. Narrower lobes need shorter arcs. The length l_j is selected with probability P_j(p), and a crossing in
+direction z has the weight
 
     a_j(z) / (l_j · mean p(d_i) P_j(p(d_i))),        a_j ∝ l_j P_j min(1, p_j / p(z)),        Σ_j a_j = 1,
 
-where p_j is the largest density for which arcs of length l_j are short enough. The sum over all lengths has the right
-mean for any a_j. Rotation along a great circle preserves the measure of arcs, so the position of d does not matter.
+where p_j is the largest density for which arcs of length l_j are short enough. The expectation, summed over all
+lengths, is correct for any a_j with sum 1. It is also correct for every position of d on the arc, because rotation
+along a great circle preserves the measure of arcs.
 """
 
 from __future__ import annotations
@@ -25,11 +27,11 @@ from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
 
 UNIFORM = 0.25
-"""Fraction of arcs through uniform directions, which cover weak lobes and arcs that start below the horizon."""
+"""Fraction of arcs through uniform directions: BSDF samples rarely cover weak lobes or start below the horizon."""
 LENGTHS = 3
 """Number of arc lengths; each is a quarter of the previous one."""
 BROAD = 256.0
-"""Density up to which the longest arcs are short enough: that of a rough metal lobe, roughness 0.02."""
+"""Density up to which the longest arcs are short enough: the density of a metal lobe of roughness 0.02."""
 ANY_LENGTH = 0.1
 """Fraction of arcs whose length does not depend on the density."""
 POSITIONS = 8
@@ -47,7 +49,7 @@ class Arc:
     c: mi.Vector3f
     w: mi.Vector3f  # unit tangent at the centre
     length: mi.Float
-    longest: float  # length of arcs without narrow lobes
+    longest: float  # largest length; all arcs have this length if no lobe is narrow
     p: mi.Float  # density of the sampled direction
     f: mi.Spectrum  # scattering of light from the sampled direction
     active: mi.Bool  # the sample is valid
@@ -88,7 +90,7 @@ class Arc:
 
     @dr.syntax
     def _density(self, active: mi.Bool) -> mi.Float:
-        """Return the mean of p P_j over all possible positions of the sample."""
+        """Return the mean of p(d_i) P_j(p(d_i)) over all possible positions d_i of the sample."""
         assert self.j is not None
         arc, j, i, total = self, self.j, mi.UInt32(0), mi.Float(0)
         while dr.hint(i < POSITIONS, exclude=[arc, j, active], label="pathreplay: density of an arc"):
@@ -103,7 +105,7 @@ class Arc:
 
 
 def density_of_samples(pdf: mi.Float) -> mi.Float:
-    """Return p in a direction that the BSDF samples with density ``pdf``."""
+    """Return the density p of samples in a direction: the BSDF's density ``pdf``, mixed with the uniform density."""
     return dr.lerp(pdf, dr.inv_four_pi, UNIFORM)
 
 
@@ -115,7 +117,7 @@ def draw_length(p: mi.Float, sampler: CounterSampler) -> mi.UInt32:
 
 
 def probability(p: mi.Float, j: mi.UInt32) -> mi.Float:
-    """Return P_j(p)."""
+    """Return P_j(p), the probability of the length l_j for a sample with density p."""
     return ANY_LENGTH / LENGTHS + (1 - ANY_LENGTH) * dr.maximum(1 - dr.abs(_level(p) - mi.Float(j)), 0)
 
 
@@ -125,21 +127,21 @@ def _position(i: mi.UInt32) -> mi.Float:
 
 
 def _level(p: mi.Float) -> mi.Float:
-    """Return the j, as a real number, whose arc length suits a density; clipped to the valid range."""
+    """Return the index j of the length that suits density p, as a real number, clipped to the valid range."""
     return dr.clip(dr.log2(p / BROAD) / 4, 0, LENGTHS - 1)
 
 
 def _length(j: mi.UInt32) -> mi.Float:
-    """Return l_j, relative to the largest length."""
+    """Return the arc length l_j, relative to the largest length."""
     return dr.exp2(-2 * mi.Float(j))
 
 
 def _suitability(p: mi.Float, j: mi.UInt32) -> mi.Float:
-    """Return min(1, p_j / p); 1 for the shortest arcs."""
+    """Return the factor min(1, p_j / p) of a_j, which is small for arcs that are too long; 1 for the shortest arcs."""
     return dr.select(j == LENGTHS - 1, 1, dr.minimum(1, BROAD * dr.exp2(4 * mi.Float(j)) / p))
 
 
 def _normalization(p: mi.Float) -> mi.Float:
-    """Return Σ_j l_j P_j min(1, p_j / p), relative to the largest length."""
+    """Return Σ_j l_j P_j min(1, p_j / p), by which all a_j are divided, relative to the largest length."""
     levels = map(mi.UInt32, range(LENGTHS))
     return sum((_length(j) * probability(p, j) * _suitability(p, j) for j in levels), mi.Float(0))

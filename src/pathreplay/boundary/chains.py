@@ -80,7 +80,7 @@ def _probe_vertex(trace: TraceConfig, path: PathState, key: mi.UInt32, active: m
     if not trace.traits.coarse_meshes:
         return probe
     triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)
-    if trace.traits.brushed_meshes:  # tangent and lobes are discontinuous at every crease
+    if trace.traits.brushed_meshes:  # the tangents of anisotropic lobes jump at every edge between triangles
         return replace(probe, signature=mixed(probe.signature, triangle))
     light, lobe = _scattered(trace, path, steady(si, at.ray, active), key, active)
     return replace(probe, triangle=triangle, light=light, lobe=lobe)
@@ -153,9 +153,9 @@ def split_chains(trace: TraceConfig, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UI
 def record_chain(
     trace: TraceConfig, s: mi.Point2f, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, at: mi.Ray3f, active: mi.Bool
 ) -> tuple[EdgePath, mi.Bool]:
-    """Record the first ``k`` vertices of the chain along ``ray``, from which the ray ``at`` leads to an edge.
+    """Record the first ``k`` vertices of the chain along ``ray``. The ray ``at`` leads from the last one to an edge.
 
-    Returns the recorded path, and the lanes in which the chain has enough vertices.
+    Returns the recorded path, and the lanes in which the chain has ``k`` vertices and a next arrival.
     """
     layout = Layout.of(trace, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
@@ -163,7 +163,7 @@ def record_chain(
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
     count = mi.UInt32(0)
     while dr.hint(path.active & (count <= k), exclude=[trace, layout], label="pathreplay: record chain"):
-        path.active &= count < k  # only the arrival of the last record is read
+        path.active &= count < k  # The path ends at the last record, of which only the arrival is read.
         u, step = path.choose(trace, sampler)
         onward, v = path.advance(trace, u, step)
         records[count] = record(layout, v)

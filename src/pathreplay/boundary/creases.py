@@ -20,10 +20,10 @@ from pathreplay.transport.vertex import Arrival, TraceConfig
 MEETS = 1e-3
 """Largest relative difference of distances at which two surfaces are considered in contact."""
 ASIDE = 2.0
-"""Distance from a contact line to which hits are moved, relative to a minimum distance. At the minimum distance, offset
-ray origins just lie in front of both surfaces."""
+"""Distance from the contact line of two surfaces to which hits are moved. The unit is the distance at which offset ray
+origins just lie in front of both surfaces."""
 STEEPEST = 8.0
-"""Cotangent of half the sharpest angle between two surfaces, 14 degrees, for which the distance above suffices."""
+"""Largest assumed cotangent of half the angle between two surfaces. The distance above suffices down to 14 degrees."""
 
 Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
 """A hit and its ray."""
@@ -36,7 +36,7 @@ class Crease:
     a: mi.PreliminaryIntersection3f
     b: mi.PreliminaryIntersection3f
     meets: mi.Bool  # two surfaces are in contact, at an angle
-    turns: mi.Bool  # on one sheet, the shading normal turns away from the ray
+    turns: mi.Bool  # the hits are on one sheet, and only one of their shading normals faces the ray
     shadow: HardShadow | None  # None without lights that cast hard shadows
 
     @staticmethod
@@ -60,7 +60,7 @@ class Crease:
         return exists if self.shadow is None else exists | self.shadow.exists
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        """Evaluate B, zero on the edge and in lanes without an edge. Differentiable in the ray and in the shapes."""
+        """Evaluate B, which is zero on the edge and in lanes without an edge. Differentiable in ray and shapes."""
         meets, turns = active & self.meets, active & self.turns
         t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, meets).t for hit in (self.a, self.b)]
         si = self.a.compute_surface_interaction(ray, mi.RayFlags.All, turns)
@@ -73,8 +73,8 @@ def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> 
 
     Ray origins are offset from their surface. If a hit is closer to a contact line than this offset, the ray origin
     lies behind the other surface, and rays may see the sky below a floor. Radiance is continuous along each surface.
-    The error of moving the hits is therefore proportional to the distance that they move, some thousandths of the size
-    of objects.
+    The error of moving the hits is therefore proportional to the distance by which they move, some thousandths of the
+    size of objects.
     """
     sides = [(at, at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal, active)) for at in (a, b)]
     normals = [dr.select(dr.dot(si.n, at.ray.d) > 0, -si.n, si.n) for at, si in sides]
@@ -82,17 +82,17 @@ def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> 
     ok = active & a.hit.is_valid() & b.hit.is_valid() & at_an_angle(*normals)
     cot = dr.minimum(dr.safe_sqrt((1 - cosine) / (1 + cosine)), STEEPEST)
     x = ASIDE * mi.math.RayEpsilon * (1 + cot) * (1 + dr.max(dr.abs(sides[0][1].p)))
-    across = dr.cross(a.ray.d, contact)  # image direction from one surface to the other
+    across = dr.cross(a.ray.d, contact)  # perpendicular to the contact line, in the image plane
     separation = dr.dot(across, a.ray.d - b.ray.d)
     moved = []
     for (at, si), n, other, side in zip(sides, normals, reversed(normals), (separation, -separation), strict=True):
-        away = dr.normalize(other - dr.dot(other, n) * n)  # along the surface, to the front of the other one
+        away = dr.normalize(other - dr.dot(other, n) * n)  # tangent to one surface, away from the other surface
         moved.append(_towards(trace, at, si.p + x * away, 4 * x, ok & (dr.dot(across, away) * side > 0)))
     return moved
 
 
 def _towards(trace: TraceConfig, at: Arrival, p: mi.Point3f, short: mi.Float, active: mi.Bool) -> Arrival:
-    """Move an arrival to the nearby point ``p``, unless a ray that starts ``short`` before p hits another surface."""
+    """Move an arrival to the nearby point ``p``, if a ray that starts ``short`` before p hits the same surface."""
     ray, to_p = mi.Ray3f(at.ray), p - at.ray.o
     ray.d = dr.normalize(to_p)
     offset = dr.maximum(dr.norm(to_p) - short, 0)

@@ -6,8 +6,8 @@ crossings with edges is 2 l / π times the integral of g along the edges. Differ
 indicate a crossing; bisection locates it.
 
 If a segment has two crossings, for example at a corner, its ends are equal. Segments with equal ends are therefore also
-probed in the middle. If only the middle differs, the segment also represents segments on which the differing part does
-not cover the middle: see `middle_weight`.
+probed in the middle. Two crossings on the same side of the middle are still missed. Segments of which only the middle
+differs therefore have a larger weight: see `middle_weight`.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ relative to the distance between the two points."""
 ROUNDING = 1e-5
 """Relative rounding error of the coordinates of points."""
 HIDES, BENDS = 0.25, 0.02
-"""Importance of an edge between two points of one shape, relative to points of two shapes. BENDS applies if both points
-are in front of each other's tangent plane, or both are behind: most such surfaces are merely curved."""
+"""Importance of an edge between two points of one shape, relative to points of two shapes. BENDS applies if each point
+is in front of the other's tangent plane, or each is behind: in most such cases, the surface is merely curved."""
 ANGLE = 1e-3
 """Smallest angle between two surfaces, in radians, that counts as an edge."""
 CRACK_BISECTIONS = 8
@@ -36,7 +36,7 @@ CRACK_BISECTIONS = 8
 PARTS = 3
 """Number of bisections in each half of a segment that locate the end of the differing part."""
 MIN_FRACTION = 9 / 32
-"""Fraction below which `middle_weight` is constant; halfway between two results of `middle_fraction`."""
+"""Fraction below which `middle_weight` is constant: the mean of two adjacent results of `middle_fraction`."""
 BEYOND = 1.5
 """Distance beyond the fixed end at which a suspected crack is probed, in lengths of the final interval. In the square
 of an emitter this distance is less than `emitters.BORDER`."""
@@ -76,10 +76,10 @@ class VisibilityProbe:
         return dr.select(self.moves | other.moves, importance, 0)
 
     def _crease(self, other: VisibilityProbe) -> mi.Bool:
-        """Return whether the probes see different triangles with a sampled direction between their planes.
+        """Return whether the probes see different triangles, and a sampled direction lies between their planes.
 
-        The triangles occlude such a direction discontinuously. Directions close to the planes count as well, because
-        they turn with the shading normal up to the crease, by at most the angle between the triangles.
+        Only one of the triangles occludes such a direction. Directions close to a plane count as well: from the probe
+        to the crease, they turn with the shading normal, by at most the angle between the triangles.
         """
         between = mi.Bool(False)
         for d in (self.light, self.lobe, other.light, other.lobe):
@@ -96,8 +96,8 @@ def at_an_angle(n: mi.Normal3f, n_other: mi.Normal3f) -> mi.Bool:
 def hides_itself(a: VisibilityProbe | mi.SurfaceInteraction3f, b: VisibilityProbe | mi.SurfaceInteraction3f) -> mi.Bool:
     """Return whether two points of one shape may lie on different sheets: one is off the tangent plane of the other.
 
-    The result is also true if the shape is merely curved between the points. Only points that are closer to each other
-    can distinguish curvature from different sheets.
+    The result is also true if the shape is merely curved between the points. Curvature and different sheets can be
+    distinguished only by points that are closer to each other.
     """
     across = b.p - a.p
     off = dr.maximum(dr.abs(dr.dot(a.n, across)), dr.abs(dr.dot(b.n, across)))
@@ -136,12 +136,12 @@ class Bracket:
     weight: mi.Float  # number of crossings that the interval represents; 0: no edge
 
     def per_length(self, length: mi.Float | float, density: mi.Float) -> mi.Float:
-        """Return the Crofton weight, π/2 / (l p(c)) per crossing: the length of edge that the interval represents."""
+        """Return the Crofton weight: the number of crossings times π/2 / (l p(c)), the length of edge per crossing."""
         return 0.5 * dr.pi * self.weight / (length * density)
 
 
 def crossing_weight(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi.Spectrum:
-    """Return K = jump · sgn(w·∂B) / |∂B|, or zero where K is not finite; ``slope`` is ∂B."""
+    """Return K = jump · sgn(w·∂B) / |∂B|, with ∂B = ``slope`` and the jump in direction ``w``; 0 if not finite."""
     n = dr.norm(slope)
     K = jump * (dr.sign(dr.dot(w, slope)) / n)
     return dr.select((n > 0) & dr.all(dr.isfinite(K)), K, 0)
@@ -151,16 +151,16 @@ def crossing_weight(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi
 class Survey:
     """Summary of the probes of a segment."""
 
-    presence: mi.Float  # likelihood and weight of an edge on the segment; 0: no edge
-    near: mi.Float  # largest value of the probes
-    bright: mi.Float  # largest value of the probes
+    presence: mi.Float  # importance of an edge, times the weight of the segment; 0: no edge
+    near: mi.Float  # largest ``near`` of the probes
+    bright: mi.Float  # largest ``bright`` of the probes
 
     @staticmethod
     def of(probes: list[VisibilityProbe], active: mi.Bool) -> Survey:
         """Summarise the probes at `probe_positions`."""
         a, b, c = probes
         ends, halves = a.edge_importance(b), dr.maximum(c.edge_importance(a), c.edge_importance(b))
-        # If only the middle differs, one of two crossings represents both, with a larger weight: see `middle_weight`.
+        # If only the middle differs, the weight is about 4: one of two crossings is selected, see `middle_weight`.
         presence = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
         near = dr.maximum(dr.maximum(a.near, b.near), c.near)
         bright = dr.maximum(dr.maximum(a.bright, b.bright), c.bright)
@@ -178,12 +178,12 @@ def detect(probe: Probe, length: mi.Float, active: mi.Bool) -> mi.Float:
 
 
 def middle_weight(m: mi.Float) -> mi.Float:
-    """Return the weight of a segment whose ends are equal and whose middle differs, on a fraction ``m`` of its length.
+    """Return the weight of a segment whose ends are equal, and whose middle part of relative length ``m`` differs.
 
-    Consider shifts of the segment along its line, in units of its length. The segment contains the differing part for
-    shifts over a range of 1 - m. The differing part also covers the middle for shifts over a range of min(m, 1 - m).
-    The weight is the ratio of the two ranges, which is unbounded for small m. Below `MIN_FRACTION`, the weight is
-    therefore constant. The constant has the right mean for parts cut off by a corner, where all m are equally likely.
+    Consider shifts of the segment along its line, in units of its length. Over a range 1 - m of shifts, the segment
+    contains the differing part. Over a range min(m, 1 - m), this part also covers the middle, and is detected. The
+    weight is the ratio of the two ranges, which is unbounded for small m. Below `MIN_FRACTION`, the weight is therefore
+    constant. Its value gives the correct expectation at corners, where all m are equally likely.
     """
     return dr.select(m < MIN_FRACTION, 2 / MIN_FRACTION - 1, dr.select(m < 0.5, (1 - m) / m, 1))
 
@@ -194,7 +194,7 @@ def middle_fraction(
 ) -> mi.Float:
     """Return the fraction of a segment, around its middle, that differs from its ends; each half is exact to 1/16.
 
-    The differing part is the set of midpoints for which the segment detects an edge, and may contain further edges.
+    A position belongs to this part if its probe differs from the probe at an end. The part may contain further edges.
     """
     half = 0.5 * length
     n, fraction, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
@@ -215,10 +215,10 @@ def middle_fraction(
 def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32) -> Bracket:
     """Bisect each segment of non-zero ``weight`` to an interval with an edge, 2^-12 as long as the segment.
 
-    If a segment has several crossings, one is selected in proportion to the likelihood of an edge, and represents all
-    of them. If only the middle differs, `middle_weight` applies. The weight becomes 0 where a surface is merely curved.
-    It also becomes 0 at cracks between triangles, through which few rays slip. A crack is recognised by an end of the
-    interval that never moves, if a probe just beyond this end equals the probe at the other end.
+    If a segment has several crossings, one is selected with a probability proportional to its importance, and the
+    weight is divided by this probability. If only the middle differs, `middle_weight` applies. The weight becomes 0
+    where a surface is merely curved, and at cracks between triangles, through which few rays pass. A crack is assumed
+    if one end of the interval stays fixed, and a probe just beyond this end equals the probe at the other end.
     """
     a, b, _ = probe_positions(length)
     weight = mi.Float(weight)

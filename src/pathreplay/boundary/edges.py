@@ -1,7 +1,7 @@
-"""Edges: propagate the motion of edges along the paths that see them, to and from the parameters and the camera.
+"""Edges: derivatives due to the motion of edges, propagated along the camera paths that see the edges.
 
-An edge is the zero set of a function B(ray, π), and moves with dB/dπ. The edge contributes to the derivative of the
-radiance at film position s
+An edge is the zero set of a function B(ray, π), and moves with dB/dπ. The contribution of the edge to the derivative of
+the radiance at film position s is
 
     - Σ K dB/dπ,
 
@@ -62,10 +62,10 @@ class Crossing(Protocol):
     weight: mi.Spectrum  # K, zero without an edge
 
     def gap(self, at: Any) -> mi.Float:
-        """Evaluate B, which is zero on the edge. Differentiable in the shapes and in ``at``.
+        """Evaluate B, the function that is zero on the edge. Differentiable in the shapes and in ``at``.
 
-        ``at`` is the observer (`ObserverVertex.moved`). Without an observer, ``at`` is the ray that slides over the
-        edge.
+        ``at`` is the vertex that sees the edge (`ObserverVertex.moved`). For edges on the film, which have no observer,
+        ``at`` is the last ray of the path.
         """
 
 
@@ -87,16 +87,16 @@ class Edges:
 
     path: EdgePath
     crossings: Sequence[Crossing]
-    observer: ObserverVertex | None  # the vertex that sees the edge; None: the path slides over the edge
+    observer: ObserverVertex | None  # the vertex that sees the edge; None for edges on the film
 
     def motion(self, ray: mi.Ray3f) -> mi.Spectrum:
-        """Evaluate - Σ K B, differentiable in the last ``ray`` of the path and in the shapes (Spectrum)."""
+        """Evaluate - Σ K B over all crossings (Spectrum). Differentiable in the path's last ``ray`` and the shapes."""
         at = ray if self.observer is None else self.observer.moved(ray)
         return -reduce(add, [crossing.weight * crossing.gap(at) for crossing in self.crossings])
 
 
 def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spectrum, lost: NonFiniteCounter) -> None:
-    """Back-propagate W·motion into the parameters; ``W`` is the adjoint of the radiance at the film positions."""
+    """Back-propagate W·`Edges.motion` into the parameters; ``W`` is the adjoint of radiance at the film positions."""
     path = edges.path
     q = backward_ray(path.ray, lambda ray: dr.sum(W * edges.motion(ray)))
     q = ray_to_camera(trace, film, path, q, lost)

@@ -3,11 +3,11 @@
 Segments lie in a unit square. For most emitters this is the square of their random numbers. Two kinds differ:
 
 - A sphere samples directions in polar coordinates. Close to the pole, straight edges have unbounded curvature in these
-  coordinates, and segments are too long to resolve them. The square is therefore mapped to a disk first.
+  coordinates, which segments cannot resolve. The square is therefore mapped to a disk first.
 - The samples of a mesh are discontinuous where they change from one triangle to the next. The square is therefore
   mapped to the cone of directions around a bounding sphere of the mesh.
 
-Both maps are uniform. They do not change which emitter point a direction follows when the scene moves.
+Both maps are uniform. With and without the maps, a direction follows the same emitter point when the scene moves.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class EmitterProbe:
 
 
 def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Bool:
-    # An emitter occludes itself only at its silhouette, due to rounding.
+    # Hits on the emitter itself do not count: they occur only at its silhouette, due to rounding.
     return active & hit.is_valid() & (hit.shape.emitter() != emitter)
 
 
@@ -180,7 +180,7 @@ class EmitterSegment(PlaneSegment):
     def followed(self, origin: mi.Interaction3f, u: mi.Point2f, anchor: EmitterProbe, active: mi.Bool) -> mi.Vector3f:
         """Return the direction to position ``u`` of the emitter, differentiable in ``u``, origin and emitter.
 
-        On a mesh, the direction follows the point that the ray of ``anchor`` hit.
+        On a mesh emitter, the direction moves with the origin and the point that the ray of ``anchor`` hit.
         """
         trace, emitter = self.observer.trace, self.emitter
         in_cone = active & (emitter.radius > 0)
@@ -202,7 +202,7 @@ class EmitterSegment(PlaneSegment):
         return VisibilityProbe.of(sample.hidden & moving)
 
     def detect(self) -> Importance:
-        """Estimate the importance of an edge; without narrow lobes, evaluate scattering only in the middle."""
+        """Estimate the importance of an edge. Without narrow lobes, only the segment's middle evaluates scattering."""
         trace, x, active = self.observer.trace, self.observer.selected, self.observer.active
         samples = [self.probe_emitter(t, active) for t in probe_positions(self.length)]
         a, b, c = (sample.light.d for sample in samples)
@@ -231,7 +231,7 @@ class EmitterSegment(PlaneSegment):
         a, b = (self.probe_emitter(t, active) for t in (bracket.a, bracket.b))
         active &= a.hidden != b.hidden
         lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
-        active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)  # otherwise, the mesh emitter's own outline
+        active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)  # not the mesh emitter's own outline
         active &= observer.is_far(dark.hit.t)
         f, pdf = observer.towards(lit.light.d, active)
         T = observer.transmittance_past_edge(lit.light, dark.hit.t, self.key, active)
@@ -239,7 +239,7 @@ class EmitterSegment(PlaneSegment):
         jump *= bracket.per_length(self.length, mi.Float(INSIDE**-2)) * dr.select(a.hidden, -1, 1)
         active &= dr.any(jump != 0) & dr.all(dr.isfinite(jump))
         u, u_lit = (self.at(dr.select(a.hidden, *t)) for t in ((bracket.a, bracket.b), (bracket.b, bracket.a)))
-        own = active & observer.separates(lit.light.d, dark.light.d)  # light.d, because rays have offset origins
+        own = active & observer.separates(lit.light.d, dark.light.d)  # not ray.d: ray origins are offset
         n = edge_normal(dark.hit, dark.ray, active)
         crossing = ShadowCrossing(jump, self, u, lit, dark, n, own, active)
         return crossing.weighted(self.direction(bracket.a), u_lit)
@@ -267,11 +267,11 @@ class ShadowCrossing:
         return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, dark.hit, dark.ray, self.active))
 
     def weighted(self, w: mi.Vector2f, u_lit: mi.Point2f) -> ShadowCrossing:
-        """Replace the weight, so far the jump along ``w``, by K; ``u_lit`` is the emitter sample on the lit side."""
+        """Replace the weight, the jump along ``w``, by its `crossing_weight`. ``u_lit`` is the end on the lit side."""
         observer, dark = self.segment.observer, self.dark
         at = observer.moved(observer.at.ray)
         slope = derivative_by_place(self.u, lambda u: self._gap(at, u))
-        # If the emitter samples jump, the lit end is far from the occluded end, and there is no edge.
+        # If the emitter samples are discontinuous, B changes more than its slope predicts, and there is no edge.
         off = dr.abs(self._gap(at, u_lit) - self._gap(at, self.u))
         jumps = off > JUMP * dr.norm(slope) * dr.norm(u_lit - self.u) + ROUNDING * (dr.norm(dark.ray.o) + dark.hit.t)
         return replace(self, weight=dr.select(self.active & ~jumps, crossing_weight(w, self.weight, slope), 0))

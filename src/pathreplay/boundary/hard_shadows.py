@@ -33,7 +33,7 @@ class ShadowTest:
 
     @staticmethod
     def of(trace: TraceConfig, at: Arrival, sampler: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
-        """Test the light that is sampled at the k-th vertex of a path; ``sampler`` is positioned at that vertex."""
+        """Test whether the light sampled at a path's k-th vertex reaches this vertex, to which ``sampler`` is set."""
         u = VertexSamples.draw(sampler).light
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
         test = ShadowTest.at(trace, si, u, _scatters(trace, si, k, active))
@@ -42,7 +42,7 @@ class ShadowTest:
 
     @staticmethod
     def at(trace: TraceConfig, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> ShadowTest:
-        """Test the light that ``u`` samples at a point. With media, boundaries of images and cones are ignored."""
+        """Test whether the light that ``u`` selects reaches ``x``. With media, projectors and spots have no limits."""
         light, Le = draw_emitter(trace.scene, x, u, active, visible=False)
         valid = active & (light.pdf != 0)
         lit, ray = valid & light.delta, x.spawn_ray_to(light.p)
@@ -79,13 +79,13 @@ class HardShadow:
         return HardShadow(trace, exists, a.dark, test, edge_normal(test.hit, test.ray, exists & ~test.outside))
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        """Evaluate B. Differentiable in the ray, which slides over the surface, in the shapes and in the light."""
+        """Evaluate B, zero on the shadow boundary, at the hit of ``ray``. Differentiable in ray, shapes and light."""
         assert self.test.met is not None
         si = self.test.met.compute_surface_interaction(ray, mi.RayFlags.All, active & self.exists)
         return self.gap_at(si, active)
 
     def gap_at(self, x: mi.Interaction3f, active: mi.Bool) -> mi.Float:
-        """Evaluate B at a point. Differentiable in the point, in the shapes and in the light."""
+        """Evaluate B, zero on the shadow boundary, at ``x``. Differentiable in ``x``, the shapes and the light."""
         test, traits, active = self.test, self.trace.traits, active & self.exists
         light, _ = self.trace.scene.sample_emitter_direction(x, test.u, False, active)
         shadow = outline_gap(self.n, x.p, light.d, test.hit, test.ray, active & ~test.outside)

@@ -1,8 +1,8 @@
-"""Importance of a segment, estimated from its probes. It determines which segments are bisected, not the mean result.
+"""Importance of a segment, estimated from its probes: it determines which segments are bisected, but adds no bias.
 
 An edge at distance r turns by 1 / r per unit of motion, and the integrand jumps at the edge by a fraction of the
-scattered radiance. The radiance of a visible surface is unknown before a path is traced. Instead, the importance is 1
-for the sky, and `DIM` for any other surface.
+scattered radiance. The radiance of a visible surface is unknown before a path is traced. Instead, a factor of the
+importance is 1 for the sky, and `DIM` for any surface.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.transport.vertex import TraceConfig
 
 WITHIN = 2.0
-"""Distance below which importance hardly increases, in `blend_length`s of the visible surface."""
+"""Distance of an edge below which its importance hardly increases, in units of the visible surface's `blend_length`."""
 DIM, OWN = 0.3, 0.1
-"""Importance where no sky is visible (DIM), and where the plane of the observer's own triangle is an edge (OWN)."""
+"""Factors of the importance: DIM if no sky is visible, OWN if the plane of the observer's own triangle is the edge."""
 UNFORESEEN = 0.1
-"""Weight of the mere presence of an edge in its importance: probes do not predict every large contribution."""
+"""Weight of an edge's presence, added to its importance: probes do not predict every large contribution."""
 MOST = 4.0
 """Largest importance of a pilot segment, relative to the mean. It is bounded because there are few pilot segments."""
 STEEP = 0.03
-"""Smallest assumed angle of an emitter across its square, in radians: it bounds the importance of small emitters."""
+"""Angle in radians added to the angle of an emitter across its square, to bound the importance of small emitters."""
 
 
 @dataclass
@@ -48,7 +48,7 @@ def _finite(x: mi.Float) -> mi.Float:
 
 
 def closeness(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Float:
-    """Return 1 / r, the rotation of the hit point per unit of its motion, bounded through `WITHIN`; 0 on a miss."""
+    """Return 1 / r, the turn of the direction to a hit per unit of its motion, bounded by `WITHIN`; 0 on a miss."""
     shape = dr.reinterpret_array(mi.UInt32, hit.shape)
     h0 = dr.gather(mi.Float, trace.traits.tables.blend_lengths, shape, hit.is_valid())
     return dr.select(hit.is_valid(), dr.rcp(hit.t + WITHIN * h0), 0)
@@ -60,13 +60,13 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
 
 
 def radiance_of(importances: list[Importance]) -> mi.Float:
-    """Estimate the mean radiance seen by arcs: scattered emitter light, divided by the arcs' scattering weights."""
+    """Estimate the mean radiance along arcs: all scattered emitter light, divided by the arcs' scattering weights."""
     from_emitters, total = (dr.sum(importance.light) for importance in importances)
     return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
 
 
 def weighed(importances: list[Importance], radiance: mi.Float) -> list[mi.Float]:
-    """Concatenate presence and importance of the edges on both kinds of segments; normalise each to sum to 1."""
+    """Return presence and importance of edges, first for segments in squares, then for arcs; each sums to 1."""
     in_squares, on_arcs = importances
     presence = dr.concat([in_squares.presence, on_arcs.presence])
     importance = dr.concat([in_squares.edges, radiance * on_arcs.edges])

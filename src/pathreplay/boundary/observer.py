@@ -27,7 +27,7 @@ from pathreplay.transport.volume.media import carried, span
 from pathreplay.transport.volume.passage import further, skip_null, transmittance_past_edge, transmittance_up_to
 
 NEAR = 10.0
-"""Smallest usable distance of an edge, in ray offsets. The offset then changes directions by at most a tenth."""
+"""Smallest usable distance of an edge, in offsets of ray origins. An offset then turns a ray by at most 0.1 radians."""
 
 
 def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool, mi.Spectrum]:
@@ -119,10 +119,10 @@ class ObserverVertex:
         if trace.media is None:
             self.origin = self.si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
         else:
-            # The flight is known, so that no sampler is needed.
+            # With a given flight, no random numbers are needed, and the sampler may be None.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # kept directions slide over facets
+        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # fixed directions slide over facets
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
         """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium: see `fly_again`."""
@@ -155,7 +155,7 @@ class ObserverVertex:
         return d, active & (pdf > 0) & ~delta
 
     def may_scatter(self, d: mi.Vector3f) -> mi.Bool:
-        """Return whether light from ``d`` may be scattered: from the side of the viewer, or by transmission."""
+        """Return whether light from ``d`` may be scattered: ``d`` is on the viewer's side, or the BSDF transmits."""
         above = mi.Frame3f.cos_theta(self.si.to_local(d)) * mi.Frame3f.cos_theta(self.si.wi) > 0
         both = above | mi.has_flag(self.si.bsdf().flags(), mi.BSDFFlags.Transmission)
         return both if self.trace.media is None else both | self.event
@@ -178,9 +178,9 @@ class ObserverVertex:
         return t > NEAR * mi.math.RayEpsilon * (1 + dr.max(dr.abs(self.origin.p)))
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
-        """Return whether directions from the observer follow ``hit`` when it moves.
+        """Return whether the direction from the observer to ``hit`` follows the hit point when the scene moves.
 
-        From a medium, directions follow only hits that scatter or emit light: see `scatter`.
+        Directions from a point in a medium follow only points of surfaces that scatter or emit light: see `scatter`.
         """
         active = active & ~self.keeps_direction & ~scatter.is_seen_through(self.trace, hit)
         if self.trace.media is None:
@@ -231,7 +231,7 @@ class ObserverVertex:
     def transmittance_past_edge(
         self, light: mi.DirectionSample3f, t: mi.Float, key: mi.UInt32, active: mi.Bool
     ) -> mi.Spectrum:
-        """Estimate the transmittance to an emitter sample past an edge at ``t``; zero without emitter sampling."""
+        """Estimate the transmittance to an emitter sample past an edge at ``t``; zero if emitters are not sampled."""
         if self.trace.media is None:
             return mi.Spectrum(1)
         needed = active & (~self.event | self.at.medium.use_emitter_sampling())
@@ -244,7 +244,7 @@ class ObserverVertex:
     def onward(
         self, arrivals: list[Arrival], t: mi.Float, key: mi.UInt32, active: mi.Bool
     ) -> tuple[mi.Spectrum, list[Arrival]]:
-        """Return the transmittance up to ``t``, and the arrivals for the rest of their rays.
+        """Return the transmittance of the rays up to ``t``, and the arrivals of rays that start at ``t``.
 
         In lanes that are not ``active``, the transmittance is 1, and the arrivals are unchanged.
         """
@@ -257,7 +257,7 @@ class ObserverVertex:
 
 
 def arrival_beyond(trace: TraceConfig, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
-    """Return the arrival ``at`` for the rest of its ray, which starts at distance ``t``, inside ``medium``."""
+    """Return the arrival of the ray that continues the ray of ``at`` from distance ``t`` on, inside ``medium``."""
     ray = further(at.ray, t)
     hit = meet(trace, ray, active)
     if trace.hide_emitters:

@@ -61,7 +61,7 @@ class ArcSegment(Arc):
         facets = close & ~observer.keeps_direction & jumps_at_facets(lengths, observer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         near = closeness(trace, seen)
-        if trace.media is not None:  # directions also follow null boundaries
+        if trace.media is not None:  # directions also follow null boundaries, whose outlines are then edges
             boundary = place_met(trace, first, active, shape_met(trace, first, ray, active), facets=False)
             place, moves = mixed(place, boundary), moves | may_move(trace, first)
             near = dr.maximum(near, closeness(trace, first))
@@ -83,7 +83,7 @@ class ArcSegment(Arc):
         return glows | (self.observer.selected.depth + 2 < trace.max_depth)
 
     def _shadow_test(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> ShadowTest:
-        """Test the shadow of the light that `path_radiance` samples at the hit."""
+        """Test whether the light that `path_radiance` samples at the hit reaches the hit point."""
         sampler, depth = CounterSampler.stream(self.key, Stream.BEYOND_EDGE), self.observer.selected.depth
         arrival = self.observer.arrival(ray, hit, mi.Float(1))
         return ShadowTest.of(self.observer.trace, arrival, sampler, depth + 1, active)
@@ -122,7 +122,7 @@ class ArcSegment(Arc):
     def _weights(
         self, bracket: Bracket, edge: OcclusionEdge, near: Side, far: Side, through: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """Return π/2 f / (l p(c)) on the near and on the far side, both with the same random numbers."""
+        """Return π/2 f / (l p(c)) for the integrand f on the near and the far side, with the same random numbers."""
         observer, trace, x, active = self.observer, self.observer.trace, self.observer.selected, edge.active
         f, pdf = observer.towards(far.ray.d, active)
         per_length = 0.5 * dr.pi * bracket.weight * self.weight(pdf, active)
@@ -179,19 +179,19 @@ class OcclusionEdge:
         return self.own | self.crease.exists
 
     def crease_gap(self, ray: mi.Ray3f, n: mi.Normal3f) -> mi.Float:
-        """Evaluate B of a crease, zero on the edge. ``n`` is the normal of the observer's triangle."""
+        """Evaluate B, which is zero on the crease. ``n`` is the normal of the observer's triangle."""
         return dr.select(self.own, dr.dot(n, ray.d), self.crease.gap(ray, self.active & ~self.own))
 
 
 @dataclass
 class HeldEdge:
-    """The edge of an occluder, which moves with the visible point of the near surface. See `Crossing`."""
+    """The motion of an occluder's edge: the direction d to the edge follows the near surface. See `Crossing`."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """Evaluate B = n·d, whose derivative is n·V_edge; 0 at a crease."""
+        """Evaluate B = n·d for the direction d to the edge. Its derivative is n·V_edge. B is 0 at a crease."""
         e = self.edge
         d = held_direction(at, e.near.ray.d, e.near.edge, e.active)
         return dr.select(e.active & ~e.is_crease, dr.dot(e.n, d), 0)
@@ -199,14 +199,14 @@ class HeldEdge:
 
 @dataclass
 class MovedSide:
-    """One side of an edge, where the direction moves with the velocity of the interior term. See `Crossing`."""
+    """The motion V of sampled directions on one side of an edge, as in the interior term. See `Crossing`."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge
     side: Side
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """Evaluate B = n·d, whose derivative is n·V; at a crease, B of the crease divided by its slope."""
+        """Evaluate B = n·d, whose derivative is n·V. At a crease, evaluate B of the crease, divided by its slope."""
         e, hit, lengths = self.edge, self.side.hit, self.edge.observer.trace.traits.tables.blend_lengths
         d, _ = moved_direction(lengths, at, self.side.ray.d, hit, e.observer.holds(hit, e.active))
         ray = mi.Ray3f(at.spawn_ray(dr.detach(d)).o, d)

@@ -1,7 +1,7 @@
 """Primary boundary term: edges on the film, seen directly, in mirrors or through glass.
 
-The film position s of a path is fixed. The camera ray and the rays of the delta lobes that follow therefore slide over
-moving surfaces: the visible point is not fixed. The radiance f(s) jumps at an edge. If the edge moves, the integral
+The film position s of a path is constant. The points at which the camera ray and the following rays of delta lobes hit
+a moving surface therefore slide over the surface. The radiance f(s) jumps at an edge. If the edge moves, the integral
 over the film changes by the jump times the area that the edge sweeps. Short segments on the film find the edges (see
 `crofton`). With N segments,
 
@@ -117,8 +117,8 @@ class PrimarySearch(FilmSearch[FilmSegment]):
     def _jump(self, split: ChainSplit, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """Estimate f_a - f_b with the same random numbers on both sides. ``ray`` is the camera ray of side a."""
         trace = self.trace
-        # The triangle planes of coarse meshes clip lobes. With steady frames, the two sides of a crease have no other
-        # difference.
+        # On coarse meshes, the planes of triangles cut off lobes. With steady frames, this is the only difference
+        # between the two sides of a crease.
         onward = replace(trace, steady_frames=trace.traits.coarse_meshes and not trace.traits.brushed_meshes)
         sides, T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:

@@ -25,9 +25,9 @@ from pathreplay.transport.vertex import TraceConfig
 PILOT_RATIO, PILOT_PER_PIXEL = 8, 2
 """Ratio of segments to pilot segments, and the largest number of pilot segments per pixel."""
 AROUND = 1.0
-"""Sum of the importances that an edge gives to the eight neighbours of its pixel, relative to the pixel itself."""
+"""Importance that an edge adds to the eight neighbours of its pixel in total, relative to the pixel itself."""
 UNREFINED = 0.25
-"""Default fraction of segments that keep the previous density: the pilot pass misses some edges."""
+"""Default fraction of segments drawn from the previous density, because the pilot pass misses some edges."""
 
 Segments = TypeVar("Segments")
 """One segment per lane."""
@@ -77,7 +77,7 @@ class FilmSegment(PlaneSegment):
     """A segment on the film."""
 
     key: mi.UInt32  # seed of the random numbers that all paths of the segment share
-    density: mi.Float  # density of the centre, per pixel, times the densities of all other drawn quantities
+    density: mi.Float  # joint density of the centre (per pixel) and of all other sampled quantities
     active: mi.Bool
 
 

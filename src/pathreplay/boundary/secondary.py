@@ -7,11 +7,11 @@ jumps from f_near to f_far. The boundary term contains the motion of the edge re
 
     dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
 
-One vertex of each camera path is selected. Edges are found by short segments (see `crofton`) in the unit square of
-emitter samples, where visibility changes, and by short arcs around BSDF samples, where the visible surface changes.
-The integrands of both kinds of samples include their MIS weights, so that the two boundary terms add up. The motion of
-x is propagated along the path. If x is static, edges between static surfaces are ignored, and no segment is spent on
-such edges.
+One vertex x of each camera path is selected. Short segments find the edges (see `crofton`). Segments in the unit square
+of emitter samples find changes of the emitter's visibility. Segments that are arcs of directions around BSDF samples
+find changes of the visible surface. The integrands of both kinds of samples include their MIS weights, so that the two
+boundary terms add up. The motion of x is propagated along the path. If x is static, edges between static surfaces are
+ignored.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport.vertex import TraceConfig
 
 UNGUIDED = 0.8
-"""Fraction of the segments that keep the previous density, because other surfaces also reflect or transmit shadows."""
+"""Fraction of segments drawn from the previous density, because reflections and refractions also show shadows."""
 
 
 @dataclass
 class CameraPath:
-    """A camera path to the vertex of two segments: one in the unit square of emitter samples, and one arc."""
+    """A camera path to a vertex with two segments: one in the unit square of emitter samples, and one arc."""
 
     s: mi.Point2f  # film position
     density: mi.Float  # of s, per pixel
     key: mi.UInt32  # seed of the path's random numbers
-    on_arc: mi.Bool  # the lane represents the arc, otherwise the segment in the square
+    on_arc: mi.Bool  # whether the lane bisects the arc or the segment in the square
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     """
 
     lengths: tuple[float, float]
-    radiance: mi.Float | None = None  # mean radiance seen by arcs, from the pilot pass
+    radiance: mi.Float | None = None  # mean radiance along arcs, estimated by the pilot pass
 
     bisection = Stream.BISECT_SECONDARY
 
@@ -67,7 +67,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         return SecondarySearch(trace, film, SegmentDensity(int(film.size.x), int(film.size.y), 0.0), lengths)
 
     def guided(self, n: int, seed: mi.UInt32) -> SecondarySearch:
-        """Refine the density with a pilot pass, whose own density follows cast shadows: see `EdgeSearch`."""
+        """Refine the density with a pilot pass, which has more segments at cast shadows: see `EdgeSearch`."""
         density = self.density
         if shapes := casters(self.trace):
             s, falls = cast_shadows(self.trace, shapes, self.film, Stream.CAST_SHADOWS.of(seed))

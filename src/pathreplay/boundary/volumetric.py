@@ -5,9 +5,9 @@ film therefore has an edge, which short segments with constant τ find (see `cro
 
     dI/dπ = - Σ K dB/dπ,    K = π/2 · f / (l p(c) p(τ) N) · sgn(w·∂B/∂s) / |∂B/∂s|,    B = n·(x + r d - z),
 
-where f is the radiance that the lit side scatters to the camera, with the transmittances from the light to x and from x
-to the camera. dB/dπ follows the motion of x in the interior term. ∂B/∂s is taken at constant τ, because the domain of
-the integral consists of film positions and distances.
+where f is the radiance that the lit side scatters to the camera, including the transmittances from the light to x and
+from x to the camera. In dB/dπ, x moves as in the interior term. ∂B/∂s is taken at constant τ, because the domain of the
+integral consists of film positions and distances.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class BeamCrossing:
 
 @dataclass(frozen=True)
 class VolumetricSearch(FilmSearch[BeamSegment]):
-    """Edge search over film positions and distances, without a pilot pass, because beams cover much of the image."""
+    """Edge search over film positions and distances, without a pilot pass: shadow boundaries fill much of the image."""
 
     bisection = Stream.BISECT_VOLUMETRIC
 
@@ -119,7 +119,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         return skip_null(self.trace, ray, meet(self.trace, ray, active), active)
 
     def _reach(self, ray: mi.Ray3f) -> mi.Float:
-        """Return the largest distance τ on a ray: the distance of its hit or, without a hit, the end of the scene."""
+        """Return the largest τ on a ray: the distance of its hit or, without a hit, the end of the bounding sphere."""
         hit, box = self._hit(ray, mi.Bool(True)), self.trace.scene.bbox()
         far = dr.norm(ray.o - box.center()) + 0.5 * dr.norm(box.extents())
         return dr.select(hit.is_valid(), hit.t, far)

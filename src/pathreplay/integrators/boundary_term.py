@@ -28,7 +28,7 @@ from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
 FILM_CLOSER, INNER_CLOSER = 5, 16
-"""Number of probed segments per resampled and bisected segment, on the film and in secondary searches."""
+"""Ratio of probed to bisected segments, in searches on the film and in secondary searches."""
 GRID = "SDFGrid"
 """Class of shapes whose silhouettes cannot be sampled: rays do not hit the points near the outline, and these points
 cannot be kept fixed on the surface."""
@@ -112,7 +112,7 @@ class Boundary:
         return ""
 
     def _searches(self, view: Pass, trace: TraceConfig, places: FilmPlaces) -> Iterator[Edges]:
-        """Run the searches that apply, and yield the edges of each."""
+        """Run the edge searches that the scene and the options require, and yield the edges of each search."""
         if why := self.obstacle(view):
             raise PathreplayError(f"{why}, or use boundary = 'none'")
         trace = self.informed(view, trace)
@@ -139,7 +139,7 @@ def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Return the sensors that count as static: all except the sensor of the pass, or all if it has a film flow."""
+    """Return the sensors that count as static. If the pass has no film flow, its sensor is excluded."""
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 
 

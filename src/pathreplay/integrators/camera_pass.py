@@ -85,7 +85,7 @@ class Pass:
     spp: int = 0
     share: float = 1.0  # weight in the mean over the parts of a split pass: see `parts`
     uses_sobol: bool = False
-    flow: FilmFlow | None = None  # motion of film positions; with a flow, rays carry only the rest of the motion
+    flow: FilmFlow | None = None  # motion of film positions; rays carry only motion that the flow does not contain
 
     @staticmethod
     def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, uses_sobol: bool = False) -> Pass:
@@ -128,11 +128,12 @@ class Pass:
     ) -> OwenSobolSampler:
         """Create the Sobol sampler of path number ``path`` of a pixel that has ``paths`` paths.
 
-        ``pixel`` is a row-major index in a film of ``width`` pixels. Each value of ``of`` selects an independent set.
+        ``pixel`` is a row-major index in a film of ``width`` pixels. Each value of ``of`` selects an independent set of
+        samples.
         """
         bits = (paths - 1).bit_length()
         morton = morton_index(pixel % width, pixel // width)
-        # The leading bits of an index that needs more than 32 bits also select the set.
+        # If the index needs more than 32 bits, its leading bits and ``of`` together select the set of samples.
         overflow = morton >> (32 - bits) if bits else mi.UInt32(0)
         return OwenSobolSampler.of((morton << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), overflow))
 

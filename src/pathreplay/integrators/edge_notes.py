@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from pathreplay.scenes.parameters import needs_ray_adjoint
 
-# Parameters that move points of a surface. Mitsuba marks other parameters that do so as discontinuous.
+# Parameters that move points of a surface. Other parameters with this effect have Mitsuba's flag `Discontinuous`.
 _POSITIONS = {"vertex_positions", "to_world", "control_points"}
 
 

@@ -91,14 +91,13 @@ class PathReplayIntegrator(PathIntegrator):
 
     ``boundary = 'auto'`` means ``all`` if something that can occlude light moves (see `edges_move`) and its boundary
     term can be computed, otherwise ``none``. The term cannot be computed with an ``attach`` other than ``delta``, for
-    sensors of type ``batch``, and in scenes with an ``sdfgrid``; the last two cases are logged. Without motion, no
-    boundary term is computed for any value of ``boundary``.
+    sensors of type ``batch``, and in scenes with an ``sdfgrid``. For such a sensor or shape, a warning is logged.
+    Without motion, no boundary term is computed for any value of ``boundary``.
 
     Gradients of media use a control variate that this integrator learns from earlier gradient passes with other seeds.
     ``null_branching`` traces one more path from a null collision, as if the medium had scattered there. Without null
     branching, the gradient with respect to extinction is wrong where extinction is zero. ``auto`` branches if
-    extinction with gradients varies in space or is zero. In these cases, branching usually also takes less time at
-    equal noise.
+    extinction with gradients varies in space or is zero. Branching then usually takes less time at equal noise, too.
 
     Not differentiated: visibility that ``boundary`` leaves out; with ``attach='none'``, all motion of shapes, cameras
     and directions; without ``null_branching``, extinction where it is zero; with ``adjoint='replay'``, weights that are
@@ -112,7 +111,7 @@ class PathReplayIntegrator(PathIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
         self.attach = choice(props, self.name, "attach", "delta", ATTACH)
-        self.moves_rays = self.attach != "none"  # gradients reach cameras and moving emitters
+        self.moves_rays = self.attach != "none"  # whether cameras and positions of emitters receive gradients
         self.interior = _interior(self.name, props, self.max_depth)
         self.adjoint, self.null_branching = self.interior.adjoint, self.interior.branch
         self.uses_sobol = choice(props, self.name, "sampling", "sobol", SAMPLING) == "sobol"
@@ -137,7 +136,7 @@ class PathReplayIntegrator(PathIntegrator):
         return self.interior, Boundary(inner=self.boundary != "primary", spp=self.boundary_spp)
 
     def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
-        """Add the film flow and its term; the other terms then differentiate the rest of the motion.
+        """Add the film flow and its term. The other terms then differentiate motion that the flow does not contain.
 
         If ``follow``, the flow may follow visible surfaces (`SurfaceFlow`). The boundary term is left out if no edge
         moves or ``auto`` cannot compute it. The interior term is left out if the flow contains the whole derivative.
@@ -241,7 +240,7 @@ class PathReplayIntegrator(PathIntegrator):
     def pixel_pass(
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]:
-        """Render and back-propagate as `render_value_and_grad` does; ``derivative`` holds its offset and slope."""
+        """Render and back-propagate as `render_value_and_grad` does; ``derivative`` is the pair (offset, slope)."""
         offset, slope = derivative
         some = None if pixels is None else mi.UInt32(pixels)
         with reached(view.scene, view.sensor, zero_is_error=True), self._pass_context(), dr.isolate_grad():

@@ -64,8 +64,8 @@ def back_propagate(view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, driver:
 class PathReplay:
     """The interior term: `forward` in forward mode, and `sweep`, `replay` or `emission_only` in reverse mode.
 
-    For what is not differentiated, see these functions. `replay` also does not differentiate weights that are exactly
-    zero.
+    The docstrings of these functions state what is not differentiated. Unlike `sweep`, `replay` does not differentiate
+    weights that are exactly zero.
     """
 
     adjoint: str  # recorded (`sweep`) or replay

@@ -42,7 +42,7 @@ class _Entry(Generic[T]):
 
     scene: mi.Scene
     about: T
-    held_once: object = field(default_factory=object)  # has the reference count of a scene without other references
+    held_once: object = field(default_factory=object)  # for comparison: an object that only this entry references
 
     @property
     def is_unreferenced(self) -> bool:
@@ -77,7 +77,7 @@ SCENES: SceneMemory = SceneMemory()
 """Facts about the scenes of this process, released according to the rules above."""
 _ONE_THREAD = threading.RLock()
 _AT_COLLECTION = threading.Lock()
-"""Lock of `_on_collection`, held while a garbage collection in any thread briefly holds `_ONE_THREAD`."""
+"""Marks that `_on_collection` may hold `_ONE_THREAD`: a pass then waits briefly instead of raising an error."""
 _passes = 0  # number of nested passes in progress
 _hidden = False  # whether objects are hidden from the collector
 
@@ -134,7 +134,7 @@ def careful() -> Iterator[None]:
 
 
 def _acquire() -> bool:
-    """Try to acquire the lock, waiting only for a garbage collection in another thread. Return whether it succeeded."""
+    """Try to acquire `_ONE_THREAD`; wait only while another thread runs `_on_collection`. Return whether it worked."""
     while not _ONE_THREAD.acquire(blocking=False):
         if not _AT_COLLECTION.locked():
             return _ONE_THREAD.acquire(blocking=False)

@@ -21,14 +21,14 @@ from pathreplay.integrators.film.image import MOST_SAMPLES, film_size
 from pathreplay.platform.traversal import known_values
 from pathreplay.scenes.parameters import SceneValue, is_transform
 
-# Largest number of samples of a pass that is not split. The relative error of a scalar's gradient is then below 1e-2 if
-# all samples contribute equally, and far below its noise otherwise.
+# Largest number of samples of a pass that is not split. If all samples contribute equally, the relative rounding error
+# of a scalar's gradient is then below 1e-2. Otherwise this error is far below the noise of the gradient.
 MOST_AT_ONCE = 2**24
-# Samples of a part of a split pass. The relative error is 1.3e-3. A part takes a few tenths of a second, compared with
-# which the cost of tracing its kernel again is negligible.
+# Samples of a part of a split pass. The relative rounding error of a scalar's gradient is 1.3e-3. A part takes a few
+# tenths of a second; the time to trace its kernel again is negligible in comparison.
 A_PART = 2**22
 # Largest number of samples per pixel in one pass or part. At this number, a pixel of constant colour has a relative
-# error of 7e-4.
+# rounding error of 7e-4.
 MOST_A_PIXEL = 2**16
 # Smallest number of samples per pixel in a part with many pixels: with fewer, the work on the film would be noticeable.
 LEAST_A_PIXEL = 4
@@ -99,7 +99,7 @@ def summed(scene: mi.Scene, passes: Sequence[Pass]) -> Iterator[Callable[[], Non
     try:
         yield (lambda: None) if sums is None else sums.take
     finally:
-        if sums is not None:  # also after an error, so that gradients of other views are kept
+        if sums is not None:  # also after an error: the sums include the gradients of earlier passes
             sums.give()
 
 
@@ -124,7 +124,7 @@ def split(sampler: mi.Sampler, spp: int, most: int) -> list[int]:
 
 def rounded(sampler: mi.Sampler, count: int) -> int:
     """Return the number of samples per pixel to which a sampler rounds ``count``."""
-    copy = sampler.clone()  # integrators differ in whether they change the count of the sensor's own sampler
+    copy = sampler.clone()  # The count of the sensor's own sampler must not change here.
     copy.set_sample_count(count)
     return int(copy.sample_count())
 

@@ -57,7 +57,7 @@ class SceneFacts:
 
     @property
     def has_seams(self) -> bool:
-        """Whether a texture has discontinuities. A recording assumes discontinuities if no earlier pass has looked."""
+        """Whether a texture has discontinuities. A recording assumes that it has, unless an earlier pass checked."""
         if self._seams is None and not is_recording():
             self._seams = has_seams(self._textures)
         return self._seams is not False

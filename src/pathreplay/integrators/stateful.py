@@ -19,7 +19,7 @@ Learned = Mapping[str, np.ndarray]
 _RECORDABLE = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
 """Classes of Mitsuba's integrators that `dr.freeze` can record."""
 _PROJECTIVE = "Projective"
-"""Part of the class names of Mitsuba's integrators that have boundary terms."""
+"""Substring that identifies Mitsuba's integrators with boundary terms by their class names."""
 
 
 @runtime_checkable
@@ -116,7 +116,7 @@ class Stateless:
             return mi.render(view.scene, sensor=view.sensor, integrator=self.integrator, spp=view.spp, seed=view.seed)
 
     def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState:
-        with dr.isolate_grad():  # as in `PathIntegrator.gradient_pass`
+        with dr.isolate_grad():  # for the same reason as in `PathIntegrator.gradient_pass`
             params = mi.traverse(view.scene)
             self.integrator.render_backward(view.scene, params, grad_in, view.sensor, view.seed, view.spp)
         return state

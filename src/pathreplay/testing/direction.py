@@ -20,8 +20,8 @@ from pathreplay.scenes.spectra import coefficients, values_of_p
 from pathreplay.testing.stencil import BACKWARD, CENTRAL, FORWARD, Stencil
 
 RELATIVE_STEP = 1e-2
-"""Step h relative to the size of the parameter. The truncation error, h², is near 1e-4, and the float32 rounding error
-of images is near 1e-5."""
+"""Step h relative to the size of the parameter. The relative error of finite differences is then near 1e-4 due to
+truncation, h², and near 1e-5 due to float32 rounding of images."""
 
 # Parameters that may be negative. All other parameters without negative entries are treated as bounded by 0.
 _SIGNED = ("vertex_positions", "vertex_normals", "vertex_texcoords", "to_world", "to_uv", "position", "direction")
@@ -56,8 +56,8 @@ def choose_line(
 ) -> Line:
     """Choose the line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
 
-    By default, the largest change of an entry is a hundredth of the parameter's size. If such a step would make a
-    non-negative parameter negative, for example a black texel, the differences are one-sided: a negative roughness or
+    By default, the largest change of an entry is a hundredth of the parameter's size. The differences are one-sided if
+    a step would make a non-negative parameter negative, for example a black texel, because negative roughness or
     density is invalid. The random direction of a transform is a translation. Infinitely ``far`` emitters (sun, sky) are
     rotated about a random axis instead, because translation does not change them. For coefficients of ``spectra``, the
     steps apply to the decoded values: see :mod:`pathreplay.scenes.spectra`.
@@ -78,7 +78,7 @@ def choose_line(
             raise PathreplayError(f"Direction for '{key}' is zero, NaN or infinite; give finite numbers, not all zero")
     else:
         v, description = _random_direction(value, transform, far, spectra, seed)
-    # A black texel has p = -8192, which must not determine the step of the other texels.
+    # Spectral coefficients have no typical size: a black texel has p = -8192, which must not determine the step of all.
     size = 1.0 if spectra else max(1.0, float(np.abs(value[v != 0]).max()))
     if step is None:
         step = RELATIVE_STEP * size / ((float(np.abs(values_of_p(v)[..., :3]).max()) if spectra else 0) or 1)
@@ -136,6 +136,6 @@ def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
             return FORWARD
         if (value - 2 * move >= 0).all():
             return BACKWARD
-    # Also if both one-sided stencils reach negative values, as with a given direction of mixed signs at zeros. Linear
-    # parameters tolerate negative values.
+    # Both one-sided stencils reach negative values, for example at zeros with a given direction of mixed signs. Then
+    # central differences are used as well: parameters in which the image is linear tolerate negative values.
     return CENTRAL

@@ -32,14 +32,14 @@ TIMEOUT_S = 300
 ROUNDS = 7
 WALLS = "red.reflectance.value"
 
-# Scene, arguments of the scene, parameter, and options of `check_gradient`. Covers surfaces, geometry, textures, media.
+# For each check: scene, arguments of the scene, parameter, and options of `check_gradient`.
 TRUTHS: dict[str, tuple[str, dict[str, int], str, Json]] = {
     "colour of a wall": ("cornell-box", {"resolution": 32}, WALLS, {}),
     "texture": ("cornell-box-photo", {"resolution": 32, "texture": 16}, "back.bsdf.reflectance.data", {}),
     "index of glass": ("glass-pane", {"resolution": 24}, "glass.eta", {}),
     "density": ("cloud", {"resolution": 16, "grid": 8, "views": 1}, "cloud.interior_medium.sigma_t.data", {}),
 }
-# Integrator and options, side of the image, samples per pixel, depth.
+# For each timing: integrator with its options, side of the image in pixels, samples per pixel, depth.
 TIMINGS: dict[str, tuple[Json, int, int, int]] = {
     f"{name}, {side} x {side}, depth {depth}": ({"type": kind, **more}, side, 16, depth)
     for side in (128, 512)
@@ -50,7 +50,7 @@ TIMINGS: dict[str, tuple[Json, int, int, int]] = {
         ("replay", "pathreplay", {"adjoint": "replay"}),
     )
 }
-# Cost of deep records and of replay; adjoint = 'auto' chooses between these two methods.
+# Timings of recorded paths and of replay at large depth, between which adjoint = 'auto' chooses.
 TIMINGS |= {
     f"{adjoint}, 512 x 512, depth {depth}": ({"type": "pathreplay", "adjoint": adjoint}, 512, 16, depth)
     for adjoint, depth in (("recorded", 256), ("recorded", 448), ("replay", 448), ("replay", 2048))

@@ -109,10 +109,10 @@ def check_gradient(  # noqa: PLR0913 (most are keyword-only)
         direction: array of the parameter's shape, not normalised. None selects 1 for a scalar, a random translation for
             ``to_world`` (a rotation for sun and sky), and random positive entries with maximum 1 otherwise.
         mode: 'backward' (``dr.backward`` through ``mi.render``) or 'forward' (``dr.forward``).
-        loss: None for the mean of the image under smooth weights between 0.5 and 1.5. The weights differ between
-            channels, so that errors of opposite sign in two places do not cancel. Otherwise a function from the image
-            (TensorXf, height x width x channels) to a scalar. The function is linearised once at a rendered image,
-            because a nonlinear loss of a noisy image would be biased, and the check concerns the renderer.
+        loss: a function from the image (TensorXf, height x width x channels) to a scalar, or None. The function is
+            linearised once at a rendered image, because a nonlinear loss of a noisy image would be biased, and the
+            check concerns the renderer. None selects the mean of the image under smooth weights between 0.5 and 1.5.
+            These weights differ between channels and places, so that errors of opposite sign do not cancel.
         seed: determines all random numbers and the direction.
         progress: called with (finished renderings, total renderings), first with 0 after all arguments are validated.
 
@@ -196,7 +196,7 @@ class _Plan:
 def _line(
     params: mi.SceneParameters, key: str, by: mi.Integrator, step: float | None, direction: ArrayLike | None, seed: int
 ) -> Line:
-    """Choose the line to check along. Raises PathreplayError if the parameter has no derivative or is too coarse."""
+    """Choose the line of a check. Raises PathreplayError for a parameter without derivative or in half precision."""
     require_differentiable(params, key, by)
     require_finite(params)
     value, owner = get_array(params[key]), params.properties[key][2]
@@ -205,7 +205,7 @@ def _line(
             f"Parameter '{key}' is stored in half precision, too coarse for finite differences; give the texture the "
             "option format='variant'"
         )
-    # Only the orientation of an infinitely distant emitter matters.
+    # An infinitely distant emitter can be rotated, but translation does not change it.
     infinite = mi.EmitterFlags.Infinite | mi.EmitterFlags.DeltaDirection
     far = isinstance(owner, mi.Emitter) and bool(mi.has_flag(owner.flags(), infinite))
     spectra = coefficient_channels(params, key) > 0

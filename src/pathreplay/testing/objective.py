@@ -104,7 +104,7 @@ class Objective:
         return np.array(self._render(integrator, seed, spp), np.float64)
 
     def difference(self, integrator: mi.Integrator, stencil: Stencil, h: float, seed: int, spp: int) -> np.ndarray:
-        """Compute the finite difference of the image."""
+        """Compute the stencil's finite difference of the image with step h."""
         return stencil(lambda t: self.image(integrator, seed, spp, t), h)
 
     def derivative(self, integrator: mi.Integrator, mode: Mode, primal: int, seed: int, spp: int) -> float:
@@ -125,19 +125,22 @@ class Objective:
             return float(dr.grad(t)[0])
 
     def forward(self, integrator: mi.Integrator, seed: int, spp: int) -> np.ndarray:
-        """Compute the derivative of the image from the integrator's forward pass alone."""
+        """Compute the derivative of the image at t = 0 by ``render_forward``, without rendering the primal image."""
         dr.forward(self._attached(), dr.ADFlag.ClearEdges)
         image = integrator.render_forward(self.scene, self.params, self.sensor, seed=seed, spp=spp)
         return np.array(image, np.float64)
 
     def backward(self, integrator: mi.Integrator, seed: int, spp: int) -> float:
-        """Compute dF/dt from the integrator's reverse pass alone."""
+        """Compute dF/dt at 0 by ``render_backward``, without rendering the primal image."""
         t = self._attached()
         integrator.render_backward(self.scene, self.params, self.adjoint, self.sensor, seed=seed, spp=spp)
         return self.collect(t)
 
     def transpose_error(self, ahead: mi.Integrator, back: mi.Integrator, seed: int, spp: int) -> float:
-        """Compute |<W, J v> - <J^T W, v>| / Σ |W J v| from a forward and a reverse pass with equal random numbers."""
+        """Compute |<W, J v> - <J^T W, v>| / Σ |W J v| from a forward and a reverse pass with equal random numbers.
+
+        W contains the weights, J is the Jacobian of the image, and v the direction of the parameter.
+        """
         tangent = self.forward(ahead, seed, spp)
         return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
 
@@ -148,7 +151,7 @@ class Objective:
         return float(dr.grad(t)[0])
 
     def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
-        """Judge gradients by finite differences along the line, ``full`` with its step and ``half`` with half of it."""
+        """Judge gradients by finite differences: ``full`` with the step of the line, ``half`` with half this step."""
         # Worst case: rounding errors of half a unit in the last place of every image, all of the same sign.
         unit = np.finfo(get_array(self.value).dtype).eps / 2
         rounding = line.stencil.rounding() * unit * self.scale / line.step

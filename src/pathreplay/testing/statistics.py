@@ -31,7 +31,7 @@ def mean_and_error(samples: ArrayLike) -> tuple[Numbers, Numbers]:
 
 
 def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
-    """Compare the means of independent samples (n, ...) and (m, ...). Without a sample axis, ``b`` is exact."""
+    """Compare the means of independent samples (n, ...) and (m, ...). If ``b`` has no sample axis, it is exact."""
     a, b = np.asarray(a), np.asarray(b)
     known = b.ndim < a.ndim
     (mean_a, error_a), (mean_b, error_b) = mean_and_error(a), (b, 0) if known else mean_and_error(b)
@@ -40,9 +40,10 @@ def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
 
 
 def welch(difference: Numbers, σ: Numbers, *parts: tuple[Numbers, int]) -> Numbers:
-    """Convert difference/σ to z, where ``parts`` (standard error, number of samples) are estimated contributions to σ.
+    """Convert difference/σ to the normal deviate z, for a σ that is partly estimated (Welch-Satterthwaite).
 
-    All other contributions to σ are known exactly and add no uncertainty to σ (Welch-Satterthwaite).
+    ``parts`` are the estimated contributions to σ: pairs (standard error, number of samples). All other contributions
+    to σ are known exactly.
     """
     difference, σ = np.asarray(difference, np.float64), np.asarray(σ, np.float64)
     noise = sum(np.asarray(error, np.float64) ** 4 / (n - 1) for error, n in parts)

@@ -35,7 +35,7 @@ class Stencil:
 CENTRAL = Stencil("central", ((-1, -0.5), (1, 0.5)))
 FORWARD = Stencil("one-sided, up", ((0, -1.5), (1, 2), (2, -0.5)))
 BACKWARD = Stencil("one-sided, down", ((0, 1.5), (-1, -2), (-2, 0.5)))
-# Stencils of fourth and third order, for steps that are a large fraction of the parameter. Delta tracking makes new
-# random decisions at every h. Unlike for smooth paths, the noise of a difference therefore does not decrease with h.
+# Stencils of fourth and third order for delta tracking, whose random decisions change with the parameter. The noise of
+# a difference f(h) - f(-h) therefore does not decrease with h, and h must be a large fraction of the parameter.
 WIDE = Stencil("wide", ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12)))
 UPWARD = Stencil("wide, up", ((0, -11 / 6), (1, 3), (2, -1.5), (3, 1 / 3)))

@@ -5,7 +5,9 @@ reference consists of two finite differences per seed, with steps h and h/2, who
 extrapolation (4 D(h/2) - D(h)) / 3 removes this error term. The change from D(h) to D(h/2), as far as it exceeds the
 noise, bounds the remaining error.
 
-    σ² = se(gradient)² + se(reference)² + step_error²,      z = (mean gradient - mean reference) / σ
+    σ² = se(gradient)² + se(reference)² + step_error² + rounding²,      z = (mean gradient - mean reference) / σ
+
+where rounding, the error of float32 sums, is `SUMMATION` times the larger of the two means.
 
 ``z`` is converted to a normal deviate, independent of the number of samples: see :mod:`pathreplay.testing.statistics`.
 """
@@ -68,7 +70,7 @@ def judge(
     larger mean. Otherwise it passes as *zero* if both means are within 4 σ of zero and 4 σ is negligible. Otherwise
     the noise is too large and the check is *inconclusive*.
     """
-    with np.errstate(invalid="ignore"):  # infinite samples are handled below
+    with np.errstate(invalid="ignore"):  # samples that are infinite get a verdict below
         reference = (4 * half_step - full_step) / 3
         # The error of D(h/2) is a third of the change caused by halving the step. This error is a conservative bound
         # for the extrapolation, which is more accurate.
@@ -104,7 +106,7 @@ def _unresolved(resolution: float, step_error: float, σ: float) -> str:
         return "the finite differences depend on the step; change --step"
     if not math.isfinite(resolution):
         return "nothing was resolved; use more --spp or --seeds"
-    # Twice the required number, because the noise and the size of the gradient are themselves uncertain.
+    # The factor 2 is a margin, because the noise and the size of the gradient are themselves uncertain.
     factor = 2 * (resolution / RESOLUTION) ** 2
     if factor > 1000:
         return "the noise hides everything; use another direction or objective, or very many more samples"

@@ -1,10 +1,10 @@
 """Differentiable delta tracking as first published: path replay with differentiated tentative collisions.
 
 A second pass with the same random numbers differentiates each tentative collision: null collisions as dσ_n/σ_n and real
-collisions as dσ_s/σ_s (supplement of Vicini, Speierer, Jakob 2021, listings 1 and 2). Where σ_n or σ_s is zero, such a
-collision is never sampled, and its derivative is missing. On a constant grid, σ_n is zero everywhere, and the whole
-derivative of the transmittance is missing. `pathreplay` does not have this limitation. This driver exists for
-comparison.
+collisions as dσ_s/σ_s (supplement of Vicini, Speierer, Jakob 2021, listings 1 and 2). Where σ_n is zero, no null
+collision is sampled, and where σ_s is zero, no real collision. The derivatives of these collisions are then missing. On
+a constant grid, σ_n is zero everywhere, and the whole derivative of the transmittance is missing. `pathreplay` does not
+have this limitation. This driver exists for comparison.
 """
 
 from __future__ import annotations

@@ -83,5 +83,5 @@ class ListingIntegrator(PathIntegrator):
     """
 
     name = "prb_volume_listing"
-    attach = "delta"  # makes motion detectable, which raises an error
+    attach = "delta"  # with 'none', motion would be ignored instead of raising an error
     interior = OtherInterior(listing, forward)

@@ -12,9 +12,9 @@ Its derivative therefore has two parts. The first differentiates the weights, wi
     ∫_D div(W v) L ds - ∮_∂D W L v·n dl.
 
 The second part is the derivative of L along the ray c(T, π). This ray moves by ∂c/∂π + ∂c/∂s v, the *rest* of the
-motion. The sum of both parts is correct for any smooth v. `CameraFlow` chooses v such that points at a distance r stay
-fixed: v = -(∂p/∂s)⁺ ∂p/∂π for the point p = o + r d on the ray. Rotation and change of the field of view then leave no
-rest; translation leaves parallax. For a static camera, `SurfaceFlow` follows the visible surfaces.
+motion. The sum of both parts is correct for any smooth v. `CameraFlow` chooses v such that each ray keeps passing
+through its point p = o + r d at a distance r: v = -(∂p/∂s)⁺ ∂p/∂π. Rotation and change of the field of view then leave
+no rest; translation leaves parallax. For a static camera, `SurfaceFlow` follows the visible surfaces.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ PINHOLE = "PerspectiveCamera"
 CAMERAS = frozenset({PINHOLE, "ThinLensCamera", "OrthographicCamera"})
 """Classes of sensors whose rays are smooth functions of the film position, also outside the border of the film."""
 ONLY_POSITIONS = "x_fov", "principal_point_offset_x", "principal_point_offset_y"
-"""Camera parameters that change only the film position of a ray. The flow contains their whole motion."""
+"""Camera parameters that only move rays to other film positions. The film flow contains all motion of such rays."""
 OTHERS = "to_world", "focus_distance", "aperture_radius"
 STEP = 1 / 256
-"""Step of central differences, in film widths. The error is 4e-6 at a field of view of 40 degrees, 1e-4 at 120."""
+"""Step of central differences, in film widths. The relative error is 4e-6 for a field of view of 40°, 1e-4 for 120°."""
 PROBES = 16
 """Number of probe rays per row and column of the film, which measure distances to the scene."""
 
@@ -66,30 +66,30 @@ class FilmFlow(Protocol):
 
     @property
     def is_all(self) -> bool:
-        """Whether the flow contains the whole derivative."""
+        """Whether the term of the flow, `FilmMotion`, is the whole derivative of the image."""
 
     @property
     def samples(self) -> int:
-        """Number of samples of a pixel for which `FilmMotion` traces one group of paths."""
+        """Number of samples of a pixel that `FilmMotion` replaces by one group of paths."""
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """Return the sensor's ray and its weight.
 
-        If the film position has gradients, the ray is differentiable in it; otherwise the ray carries the rest of the
-        motion.
+        If the sample's position has gradients, the ray is differentiable in this position. Otherwise the derivative of
+        the ray is the rest of the motion, which the flow does not contain.
         """
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
-        """Return v, a value of zero that is attached to the parameters."""
+        """Return zero, attached to the parameters such that its derivative is the film velocity v."""
 
     def divergence(self, sample: Sample) -> mi.Float:
-        """Return ∂v_x/∂x + ∂v_y/∂y, a value of zero that is attached to the parameters."""
+        """Return zero, attached to the parameters such that its derivative is the divergence ∂v_x/∂x + ∂v_y/∂y."""
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
         """Return whether the velocity at a film position may be non-zero."""
 
     def leaves_rest_at(self, position: mi.Point2f) -> mi.Bool:
-        """Return whether the ray through a film position may carry a rest of the motion."""
+        """Return whether the ray through a film position may have motion that the flow does not contain."""
 
     def carry_tangents(self) -> None:
         """Propagate tangents of the parameters to values that the terms of a pass share, once for all terms."""
@@ -100,8 +100,8 @@ class CameraFlow:
     """The flow of a moving sensor: see `FilmFlow`."""
 
     sensor: mi.Sensor
-    r: mi.Float  # points at this distance along the rays stay fixed
-    leaves_rest: bool  # whether rays carry a rest of the motion
+    r: mi.Float  # distance of the points through which the rays keep passing
+    leaves_rest: bool  # whether rays have motion that the flow does not contain
     is_all: bool
     samples: int = 2
 
@@ -164,7 +164,7 @@ def film_velocity(δp: mi.Vector3f, derivatives: RayDerivatives, t: mi.Float) ->
 
 
 def move_with_position(ray: mi.Ray3f, derivatives: RayDerivatives, v: mi.Vector2f) -> None:
-    """Add to a ray's motion the effect of a motion v of its film position."""
+    """Add the motion of a ray that a velocity v of its film position causes."""
     o, d = derivatives
     ray.o += o[0] * v.x + o[1] * v.y
     ray.d += d[0] * v.x + d[1] * v.y
@@ -193,9 +193,9 @@ def ray_derivatives(sensor: mi.Sensor, sample: Sample) -> RayDerivatives:
 
 
 def _is_carried(sensor: mi.Sensor) -> bool:
-    """Return whether a change of the camera's pose leaves a rest of the motion.
+    """Return whether the camera's pose has gradients that move rays in a way that the flow does not contain.
 
-    For a pinhole camera, only translation leaves a rest. For any other camera, every gradient of the pose counts.
+    For a pinhole camera, only translation does so. For any other camera, all gradients of the pose count.
     """
     poses = with_gradients(sensor, "to_world")
     if sensor.class_name() != PINHOLE:

@@ -63,7 +63,7 @@ class FilmPlaces:
         return (self.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
 
     def undeveloped(self, grad_in: mi.TensorXf) -> mi.TensorXf:
-        """Return the adjoint g_j / ∫ h_j of block pixels. The image has the adjoint g, and pixel j the filter h_j."""
+        """Return the adjoint g_j / ∫ h_j of each block pixel j, with the adjoint g of the image and the filters h_j."""
         with dr.resume_grad():
             pixels = mi.TensorXf(self._block().tensor())
             dr.enable_grad(pixels)
@@ -82,7 +82,7 @@ class FilmPlaces:
         return dr.select(inside, _splat_adjoint(lambda L: self._put(s, L, wavelengths), dr.width(s), block_grad), 0)
 
     def image(self, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
-        """Splat radiance ``L`` at film positions, each with the weight of one pixel's area; return the image."""
+        """Splat radiance ``L`` at film positions, and return the image. Each sample weighs as much as one pixel."""
         inside = dr.all((s >= 0) & (s < self.size))
         return self.developed(self._put(s, dr.select(inside, L, 0), wavelengths))
 
@@ -91,7 +91,7 @@ class FilmPlaces:
         return _splat_adjoint(lambda L: self.pixels(pixel, L, wavelengths), dr.width(pixel), block_grad)
 
     def pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
-        """Sum radiance ``L`` by pixel (row-major index) in a block without filter, and return its pixels."""
+        """Sum radiance ``L`` by pixel (row-major index), without a filter; return the pixels of the block."""
         film, filtered = self.view.sensor.film(), self._block()
         offset, size = mi.ScalarPoint2i(film.crop_offset()), mi.ScalarVector2u(film.crop_size())
         block = mi.ImageBlock(size, offset, filtered.channel_count())

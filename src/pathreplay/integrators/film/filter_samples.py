@@ -43,7 +43,7 @@ class FilterSamples:
     @staticmethod
     def of_derivative(film: mi.Film) -> FilterSamples:
         """Create the sampler of the filter's derivative. A jump, as at the ends of a box, becomes a point mass."""
-        radius = film.rfilter().radius() * STEPS / (STEPS - 1)  # jumps at the filter's ends then lie inside a step
+        radius = film.rfilter().radius() * STEPS / (STEPS - 1)  # outer steps then contain jumps at the filter's ends
         step = 2 * radius / STEPS
         x = _step_centres(radius)
         return FilterSamples._of(radius, film.rfilter().eval(x + 0.5 * step) - film.rfilter().eval(x - 0.5 * step))
@@ -63,7 +63,7 @@ class FilterSamples:
         return dr.lerp(begin, end, position - mi.Float(i))
 
     def draw(self, u: mi.Float, low: mi.Float, high: mi.Float) -> mi.Float:
-        """Map a random number ``u`` to an offset at which the cumulative distribution is in [``low``, ``high``]."""
+        """Return the offset at which the cumulative distribution is ``low`` + ``u`` (``high`` - ``low``)."""
         v = dr.lerp(low, high, u)
         last = STEPS - 1
         i = dr.minimum(dr.binary_search(0, last, lambda i: dr.gather(mi.Float, self.cdf, i) <= v), last)

@@ -4,9 +4,9 @@ With the filter h_j of pixel j, restricted to the film D, and the velocity v of 
 
     dI_j/dπ = 1/∫_D h_j · ( ∫_D div(h_j v) L ds - ∮_∂D h_j L v·n dl ).
 
-Filters are products h_j = f(x) f(y), and f(x) jumps to zero at the border of the film. The slope of f inside the film
-and the jump therefore form one measure df(x). The mass of df outside the film is concentrated at the border. The three
-integrals are
+Filters are products h_j = f(x) f(y), and f(x) jumps to zero at the border of the film. The derivative of f is therefore
+a measure df(x): the slope of f inside the film, and the jump as a point mass at the border. The derivative of I_j
+consists of the three integrals
 
     ∫ f(y) dy ∫ v_x L df(x),        ∫ f(x) dx ∫ v_y L df(y),        ∫_D h_j (∂v_x/∂x + ∂v_y/∂y) L ds.
 
@@ -14,10 +14,10 @@ The measure df is odd: two positions at the same distance to the right and to th
 signs. Paths are sampled in such pairs with the same random numbers, so that common parts of their radiance cancel, as
 in a finite difference of two images. Paths only estimate L: they are not differentiated, and no edges are sampled.
 
-On a film of many pixels, the two positions are close to each other and their difference is mostly noise. The adjoint
-W_j of the pixels is therefore split into its local mean W̄_j and the remainder. The local mean is smooth, so that the
-contributions of adjacent pixels cancel better than those of a pair. A path at x contributes to all pixels of its row
-at once, with the weight
+On a film of many pixels, the two positions of a pair are close to each other, and the difference of their radiance is
+mostly noise. The adjoint W_j of pixel j is therefore split into its local mean W̄_j and the remainder W_j - W̄_j. The
+local mean is smooth, so that the contributions of one path to adjacent pixels almost cancel. A path at x that was
+sampled for the pixel at x_j therefore contributes to all pixels of the row, with the weight
 
     (W_j - W̄_j) sgn df(x - x_j) + Σ_i W̄_i df(x - x_i) / Σ_i |df(x - x_i)|,
 
@@ -50,9 +50,9 @@ from pathreplay.transport.vertex import TraceConfig
 GROUP = 5
 """Number of paths with the same random numbers: right and left, above and below, and one for the divergence."""
 BLUR, MOST = 16, 16
-"""The local mean of the adjoint extends to each side over 1 / BLUR of the film's shorter side, at most MOST pixels.
-
-The noise of the smooth part falls with the third power of that length, if the adjoint is smooth over it."""
+"""The local mean of the adjoint is taken over a square. From a pixel to each side, the square extends over 1 / BLUR of
+the film's shorter side, but at most MOST pixels. The noise of the term that contains the local mean falls with the
+third power of this length, if the adjoint is smooth over the square."""
 
 
 @dataclass
@@ -62,16 +62,16 @@ class FlowPaths:
     pixel: mi.UInt32  # row-major index
     sample: Sample  # sample of the camera ray
     axis: mi.UInt32  # axis along which the two positions of a pair differ
-    single: mi.Bool  # whether the path is the one for the divergence
+    single: mi.Bool  # whether the path estimates the divergence and belongs to no pair
     offset: mi.Float  # distance of a path of a pair from the pixel centre, along the axis
     derivative: FilterSamples  # sampler of the offsets: the derivative of the filter
-    L: mi.Spectrum  # weighted radiance, the factor of the velocity or divergence
+    L: mi.Spectrum  # weighted radiance, to be multiplied by the velocity or the divergence
     wavelengths: mi.Spectrum
 
 
 @dataclass(frozen=True)
 class FilmMotion:
-    """The term of the film flow (see `Term`). Not differentiated: the rest of the motion, which other terms contain."""
+    """The term of the film flow (see `Term`). Not differentiated: motion of rays that the flow does not contain."""
 
     flow: FilmFlow
 
@@ -108,15 +108,15 @@ class FilmMotion:
         return ""
 
     def _flow_factor(self, view: Pass, f: FlowPaths) -> mi.Float:
-        """Return the velocity of pairs along their axis, in pixels, and the divergence for single paths."""
+        """Return one factor per path: the velocity along the axis of its pair, in pixels, or else the divergence."""
         v = self.flow.velocity(f.sample) * mi.Vector2f(*view.size)
         return dr.select(f.single, self.flow.divergence(f.sample), dr.select(f.axis == 0, v.x, v.y))
 
     def _smooth_factors(self, view: Pass, f: FlowPaths) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Return pixels and factors. The adjoint of a path of a pair receives the sum of factor · W̄ over the pixels.
+        """Return (pixel, factor) of each pixel to which a path contributes through the local mean W̄ of the adjoint.
 
-        The factors are relative to the weight of the path's own pixel. The first entry subtracts W̄ of the path's own
-        pixel, because the full adjoint W contains this mean.
+        For a path of a pair, the sum of factor · W̄ is added to the adjoint W of the path's own pixel. The first entry
+        subtracts W̄ of the own pixel, which W contains. For a path that is not part of a pair, all factors are zero.
         """
         width, height = view.size
         derivative, along_x = f.derivative, f.axis == 0

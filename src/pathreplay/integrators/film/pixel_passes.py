@@ -97,7 +97,8 @@ def pixel_loss(
 ) -> PixelLoss:
     """Gather the loss derivative for the pixel of each lane.
 
-    The lanes are all pixels or, if given, ``pixels``; the tensors then have one row per pixel.
+    There is one lane for each pixel of the film or, if given, for each entry of ``pixels``. With ``pixels``, the
+    tensors have one row per entry.
 
     Raises PathreplayError for an unsuitable number of samples, a wrong shape, or repeated or invalid pixels.
     """

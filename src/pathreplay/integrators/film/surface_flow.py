@@ -11,9 +11,9 @@ silhouettes. Points at grazing angles therefore have the largest weights. The ve
     v = Σ K W u / (K_0 + Σ K (W + S)),     W = 1 / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
 
 over nearby points, where r is their distance from the node on the film. Static points contribute with u = 0. Between
-nodes, v is interpolated. In a narrow field of view, u is large, and following u causes more noise than sliding does.
-The term S then reduces v. Every v gives the same derivative (see `camera_flow`). The choice above leaves little motion
-to the interior and boundary terms.
+nodes, v is interpolated. In a narrow field of view, u is large, and film positions that follow u cause more noise than
+fixed film positions. The term S then reduces v. Every v gives the same derivative of the image (see `camera_flow`).
+With this v, little motion is left for the interior and boundary terms.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class SurfaceFlow:
             W = dr.select(visible, grazing + S, 0)
             u = film_velocity(si.p - dr.detach(si.p), derivatives, t) * grazing / (grazing + S)
             moves = visible & may_move(trace, hit)
-            dr.eval(u, W, moves)  # gathered by all nodes below
+            dr.eval(u, W, moves)  # once, because every node gathers from these arrays
 
             index = dr.arange(mi.UInt32, NODES * NODES * PROBES * PROBES)
             node, i = index // (PROBES * PROBES), index % (PROBES * PROBES)
@@ -116,7 +116,7 @@ class SurfaceFlow:
         return dr.gather(mi.Bool, self.flows, _node(_cell_at(position)[0], 0, 0))
 
     def leaves_rest_at(self, position: mi.Point2f) -> mi.Bool:
-        """Return whether the film position moves."""
+        """Return whether the film position may move: its ray then moves with it."""
         return self.moves_at(position)
 
     def carry_tangents(self) -> None:
@@ -133,9 +133,9 @@ class SurfaceFlow:
 def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     """Return whether film positions may follow visible surfaces.
 
-    All other surfaces then slide under the film positions, so that the edges of all surfaces must be sampled. Edges
-    behind mirrors, glass and thin sheets and edges on B-spline curves cannot be sampled. Media are not supported.
-    (Seams of textures are not sampled either: see `has_seams`.)
+    Film positions that follow one surface move relative to all other surfaces, whose edges must then be sampled. Edges
+    behind mirrors, glass and thin sheets and edges of B-spline curves cannot be sampled. Media are not supported. The
+    caller must exclude textures with seams (see `has_seams`), which cannot be sampled either.
     """
     traits = trace.traits
     hidden = traits.mirrors or traits.veils or traits.splines
