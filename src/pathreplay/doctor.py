@@ -75,7 +75,7 @@ class DoctorReport:
         if not self.variants:
             line("  none tried")
         if self.remedies:
-            line(("Ways out", "bold"), *("\n  - " + remedy for remedy in self.remedies))
+            line(("Remedies", "bold"), *("\n  - " + remedy for remedy in self.remedies))
         usable = ", ".join(variant.name for variant in self.variants if variant.works)
         line(("Verdict", "bold"), f": pathreplay runs here ({usable})" if usable else ": pathreplay does not run here")
 

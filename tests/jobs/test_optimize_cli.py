@@ -1,4 +1,4 @@
-"""Bad input to ``pathreplay optimize``: one line that names thing, value and way out; status 2; nothing written."""
+"""Bad input to ``pathreplay optimize``: one line that names thing, value and remedy; status 2; nothing written."""
 
 from __future__ import annotations
 

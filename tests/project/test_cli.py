@@ -133,7 +133,7 @@ def test_wrong_usage_ends_with_2(run, arguments: tuple[str, ...]) -> None:
     ("error", "line"),
     [
         (
-            PathreplayError("key \x1b[31m\0 " + "y" * 100_000 + " the way out"),
+            PathreplayError("key \x1b[31m\0 " + "y" * 100_000 + " the remedy"),
             r"key \x1b[31m\x00 " + "y" * 50,
         ),
         (

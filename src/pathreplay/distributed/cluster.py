@@ -32,7 +32,7 @@ from pathreplay.platform.interrupts import undisturbed
 OLDEST = (2, 60)
 """First version of Ray whose token authentication covers clusters that a program starts."""
 
-# If this variable is off, Ray uses loopback addresses. Ray has the variable for systems whose firewalls block clusters.
+# With the value 0, Ray uses loopback addresses. Ray has this variable for systems whose firewalls block clusters.
 _MANY_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _MODE, _TOKEN, _ADDRESS = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"
 _LONGEST_FOLDER = 20
@@ -53,7 +53,7 @@ class Cluster:
     own: bool
     """Whether the cluster is private to this run."""
     processes: list[psutil.Process] = field(default_factory=list)
-    """Processes of a private cluster without which Ray answers no request."""
+    """Processes that a private cluster needs in order to answer requests: GCS server and raylet."""
     _checked: float = -1e9
 
     def is_shared(self) -> bool:
@@ -101,7 +101,7 @@ def _runs(process: psutil.Process) -> bool:
 
 def load_ray() -> ModuleType:
     """Import Ray. Raises PathreplayError if it is not installed or too old."""
-    os.environ.setdefault(_MODE, "token")  # Ray reads the variable while it is imported
+    os.environ.setdefault(_MODE, "token")  # Ray reads this variable on import
     # Keep Ray from hiding devices from actors that reserve no GPU. Ray warns if the variable is not set.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
@@ -152,7 +152,7 @@ def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
 
 
 def _start(ray: ModuleType, stack: contextlib.ExitStack, cores: int) -> Cluster:
-    """Start a private cluster, which ends with ``stack``. Raises PathreplayError if Ray cannot start safely."""
+    """Start a private cluster, to be ended by ``stack``. Raises PathreplayError if Ray cannot start safely."""
     temporary = tempfile.gettempdir()
     # mkdtemp admits only this user; Ray's default folder admits all. Paths of sockets may have at most 107 characters.
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=temporary if len(temporary) <= _LONGEST_FOLDER else "/tmp")
@@ -250,15 +250,15 @@ def _require_closed(ray: ModuleType, address: str) -> None:
 def _private_environment(ray: ModuleType) -> Iterator[None]:
     """Make Ray start clusters within this block on loopback, with our token, and without usage statistics."""
     settings = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
-    # Ray would end this process if the head node is silent for this time (seconds); `Cluster.require` raises before.
+    # Seconds without a response of the head node after which Ray ends this process. `Cluster.require` raises earlier.
     settings["RAY_gcs_rpc_server_reconnect_timeout_s"] = str(10**6)
-    settings["RAY_worker_niceness"] = "0"  # actors do the work of the run, and get the priority of this process
+    settings["RAY_worker_niceness"] = "0"  # keep the priority of this process, because the actors do its work
     before = {name: os.environ.get(name) for name in settings}
     constants = ray._private.ray_constants
     many = constants.ENABLE_RAY_CLUSTER
     os.environ.update(settings)
     constants.ENABLE_RAY_CLUSTER = False
-    ray._raylet.Config.initialize("")  # make Ray read the settings again, and the token below
+    ray._raylet.Config.initialize("")  # make Ray read the settings again (next line: the token)
     ray._raylet.AuthenticationTokenLoader.instance().reset_cache()
     try:
         yield
@@ -274,9 +274,9 @@ def _private_environment(ray: ModuleType) -> Iterator[None]:
 def _own_sessions(ray: ModuleType) -> Iterator[None]:
     """Start Ray's processes in separate process sessions within this block (only on Linux).
 
-    A terminal or a batch scheduler signals all processes of a command. After a signal, this process finishes the
-    iteration and writes its results, for which it needs the actors. The kernel still ends Ray's processes when this
-    process ends.
+    A terminal or a batch scheduler sends a signal to all processes of a command. After a signal, this process still
+    needs the actors, because it finishes the iteration and writes its results. The kernel still ends Ray's processes
+    when this process ends.
     """
     services = ray._private.services
     plain = services.ConsolePopen

@@ -77,7 +77,7 @@ class _Call:
 
 @dataclass
 class WorkerPool:
-    """The actors of a run and their pending requests, which the executors of the job and of its baseline share."""
+    """The actors of a run and their pending requests. The executors of the job and its baseline share this pool."""
 
     cluster: Cluster
     actors: dict[int, Any]
@@ -135,7 +135,7 @@ class WorkerPool:
         return [(self.calls.pop(reference), reference) for reference in ready]
 
     def fetch(self, call: _Call, reference: Reference) -> list[Answer] | None:
-        """Return the answers to the shards of a request; None if the actor was lost, or the request built the problem.
+        """Return one answer per shard of a request. Returns None if the actor was lost or has only built its problem.
 
         Raises PathreplayError if no actor is left. Raises the error of an evaluation that failed.
         """
@@ -253,13 +253,13 @@ class RayExecutor:
     def _hand_out(
         self, step: Step, shards: Sequence[Shard], size: int, values: Arrays | Reference, learned: Arrays | Reference
     ) -> None:
-        """Send requests to idle actors. ``size`` is the size of the values, and of the gradients, in bytes."""
+        """Send requests to idle actors. ``size`` is the number of bytes of the values, and of a shard's gradients."""
         idle = self.pool.idle()
         for number in step.in_turn(idle):
             late = len(step.again)
             first = step.next(number, time.monotonic(), idle)
             if first is None:
-                break  # the other idle actors, which may be many, would hardly get a shard either
+                break  # skip the other idle actors: they would hardly get a shard either, and may be many
             self.pool.counts.twice += len(step.again) - late
             indices = (first, *step.along(number, size, len(self.pool.ready)))
             self.pool.ask(
@@ -319,7 +319,7 @@ def require_executor(config: Config) -> None:
 
 @contextmanager
 def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Tell) -> Iterator[WorkerPool | None]:
-    """Start the actors of a job, which end with this block, and yield them; None if the job runs in this process.
+    """Start the actors of a job, yield them, and end them after this block; None if the job runs in this process.
 
     ``tell`` receives log lines, and ``status`` the progress within a step. Raises PathreplayError if the cluster cannot
     be used or is too small.

@@ -2,9 +2,9 @@
 
 A step is an iteration of the optimisation. Each actor evaluates the same views in every step, because it has compiled
 their kernels. An actor that has finished its own shards takes one from the actor with the most remaining work, so that
-all actors finish at about the same time. If no shard is waiting, an idle actor also computes a shard that takes much
-longer than expected, and the first result counts. Short shards share one request, because each request has a fixed
-cost.
+all actors finish at about the same time. If no shard is waiting, an idle actor repeats a running shard that takes much
+longer than expected, and the first result counts. Several short shards are sent in one request, because each request
+has a fixed cost.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Actor = int
 """Number of an actor, which stays the same if the actor is restarted."""
 
 LATE = 2.0
-"""A request is late after LATE times its expected duration, assuming that its first shard has no kernels yet.
+"""A request is late after LATE times its expected duration, which includes compiling the kernels of its first shard.
 
-The factor exceeds the timing noise of a shared machine, and a second actor that starts the shard can still be first.
+The factor exceeds the timing noise of a shared machine. A second actor that starts the late shard can still be first.
 """
 
 WARM = 2
-"""Number of evaluations after which an actor has the kernels of a view: the first traces, the second records them."""
+"""Evaluations after which an actor has a view's kernels: the first traces them, the second records them for replay."""
 
 SHORTEST_S, LONGEST_S = 0.01, 0.1
 """Smallest and largest time limit, in seconds, of a request of several short shards.
@@ -68,12 +68,12 @@ class Scheduler:
     times: dict[tuple[Actor, Kind], int] = field(default_factory=dict)
     """Number of evaluations per actor and kind."""
     waited: dict[Actor, float] = field(default_factory=dict)
-    """Seconds of work in earlier steps that an actor left to the owner, because the owner would finish it sooner."""
+    """Per actor: seconds of other owners' work that it declined in earlier steps, because the owners were faster."""
     refused: dict[Actor, float] = field(default_factory=dict)
-    """Seconds of such work in the current step."""
+    """Per actor: seconds of other owners' work that it declined in the current step."""
 
     def begin(self) -> None:
-        """Begin a step: add ``refused`` to ``waited``."""
+        """Begin a step: add the declined work of the previous step to that of earlier steps."""
         for actor, seconds in self.refused.items():
             self.waited[actor] = self.waited.get(actor, 0.0) + seconds
         self.refused.clear()
@@ -100,7 +100,7 @@ class Scheduler:
             if kind in self.warm:
                 self._learn(seconds - known)
         elif kind in self.warm:
-            seconds = min(seconds, LATE * known)  # an outlier must not delay the detection of the next late shard
+            seconds = min(seconds, LATE * known)  # limit outliers, which would delay the detection of late shards
             self.seconds[kind] = SMOOTHING * known + (1 - SMOOTHING) * seconds
         else:
             self._learn(known - seconds)
@@ -136,7 +136,7 @@ class Step:
         scheduler.begin()
         self.kinds = [kind_of(shard) for shard in shards]
         self.waiting: dict[Actor | None, list[int]] = {}
-        """Indices of waiting shards by owner (None: no owner), by ascending duration, and then by descending index."""
+        """Indices of waiting shards by owner (None: no owner), sorted by ascending duration, then descending index."""
         self.left: dict[Actor | None, float] = {}
         """Expected seconds of all waiting shards of an owner: the sum of their ``cost``."""
         self.cost: dict[int, float] = {}
@@ -172,8 +172,9 @@ class Step:
         most = self._busiest(now)
         if most is not None:
             other, left = most
-            # Leave a shard to its owner if the owner finishes it sooner. Work that the actor has left to owners in
-            # earlier steps raises this limit: otherwise an actor that joins late would never compile any kernels.
+            # Leave a shard to its owner if the owner finishes all its work before this actor would finish the shard.
+            # Work that this actor declined in earlier steps is added to the owner's work: otherwise, an actor that
+            # joins late would never compile any kernels.
             worth = left + self.scheduler.waited.get(actor, 0.0)
             for place in reversed(range(len(self.waiting[other]))):
                 if (self.scheduler.expected(actor, self.kinds[self.waiting[other][place]]) or 0.0) < worth:
@@ -190,15 +191,15 @@ class Step:
     def along(self, actor: Actor, size: int, actors: int) -> list[int]:
         """Add short shards from the actor's own queue to the request that `next` has started; return their indices.
 
-        The time of a request is limited to a fraction of the actor's remaining work, and to the step's work divided by
-        the number of ``actors``. Requests therefore become shorter towards the end of a step, and all actors finish at
-        about the same time. `TOGETHER` limits the number of shards, whose gradients have ``size`` bytes each.
+        The time of a request is limited to a fraction of the actor's remaining work, and to the work of the whole step
+        divided by the number of ``actors``. Requests therefore become shorter towards the end of a step, and all actors
+        finish at about the same time. `TOGETHER` limits the gradients of a request, which are ``size`` bytes per shard.
         """
         waiting, request = self.waiting.get(actor, []), self.running[actor]
         if not self.scheduler.holds(actor, self.kinds[request.shards[0]]):
             return []
         room, first = TOGETHER // max(1, size), self._seconds(actor, request.shards[0])
-        even = self.all / actors * (1 + 1e-6)  # rounding must not exclude the last of several equally long shards
+        even = self.all / actors * (1 + 1e-6)  # tolerance: rounding must not exclude the last of several equal shards
         limit = min(LONGEST_S, even, max(SHORTEST_S, AHEAD * (first + self.left.get(actor, 0.0))))
         while waiting and len(request.shards) < room and self.scheduler.holds(actor, self.kinds[waiting[-1]]):
             more = request.more + self.cost[waiting[-1]]
@@ -229,9 +230,9 @@ class Step:
         return first
 
     def lost(self, index: int, actor: Actor) -> None:
-        """Make the shard of a lost actor wait again, unless it is done or another actor is evaluating it.
+        """Mark a shard as waiting because its actor was lost, unless it is done or another actor is evaluating it.
 
-        Waiting shards of the lost actor get the current owner of their kind, usually None (see `forget`).
+        The lost actor's waiting shards are assigned to the actor that now owns their kind, usually none (see `forget`).
         """
         self.heard(index, actor)
         self.left.pop(actor, None)
@@ -272,7 +273,7 @@ class Step:
         return 0.0 if owner is None else self.scheduler.expected(owner, self.kinds[index]) or 0.0
 
     def _busiest(self, now: float) -> tuple[Actor, float] | None:
-        """Return the owner of waiting shards with the most remaining work, and the expected seconds of this work."""
+        """Among the owners of waiting shards, return the one with the most remaining work, and this work in seconds."""
         busiest: tuple[Actor, float] | None = None
         for owner, indices in self.waiting.items():
             if owner is None or not indices:
@@ -286,9 +287,9 @@ class Step:
         return busiest
 
     def _latest(self) -> tuple[float, int] | None:
-        """Return the time at which the first running shard becomes late, and its index.
+        """Return the time at which the next running shard becomes late, and the index of this shard.
 
-        Shards that a second actor is also evaluating are excluded. Returns None if there is no such shard.
+        Shards that a second actor is also evaluating are excluded. Returns None if no shard can become late.
         """
         late, seconds, extra = [], self.scheduler.seconds, self.scheduler.extra
         for request in self.running.values():

@@ -44,7 +44,7 @@ class Ready:
     process: int
     versions: str
     machine: str
-    """Processor and LLVM version, which determine how its kernels round."""
+    """Processor and LLVM version, which determine how the actor's kernels round."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def versions() -> str:
 
 
 class Log(Protocol):
-    """A log whose ``lines`` Mitsuba has written."""
+    """A log that collects Mitsuba's messages in ``lines``."""
 
     lines: list[str]
 

@@ -27,7 +27,7 @@ class Parameter:
             Default: the value in the scene.
         bounds: lower and upper bound, enforced by projection after each step.
         learning_rate: learning rate; with Adam, approximately the length of a step. Default: that of the problem.
-        parameterization: ``"log"``, ``"softplus"`` or ``"logit"``: function of the value in which steps are taken.
+        parameterization: ``"log"``, ``"softplus"`` or ``"logit"``: steps are taken in this function of the value.
         resolutions: sizes of a grid, coarse to fine.
         refine_at: iterations at which the grid is refined.
         pyramid: take steps in the levels of a Laplacian pyramid of a texture or volume.

@@ -86,10 +86,11 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
     Args:
         problem: the problem. Afterwards its scene has the resulting values.
         optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"``, ``"l-bfgs-b"``, or a mapping with
-            ``type`` and options. An optimizer of `mitsuba.ad` must be empty; its learning rate applies to parameters
-            without their own. Any other object needs ``step(values, gradients, learning_rates, loss) -> values``, with
-            arrays by name. A function needs the interface of `scipy.optimize.minimize`, such as
-            ``functools.partial(scipy.optimize.minimize, method="SLSQP")``, and supports up to 1000 entries.
+            ``type`` and options. An optimizer of `mitsuba.ad` must have no variables yet. Its learning rate applies to
+            parameters without a learning rate of their own. Any other object needs a method
+            ``step(values, gradients, learning_rates, loss) -> values``, with arrays by name. A function needs the
+            interface of `scipy.optimize.minimize`, such as ``functools.partial(scipy.optimize.minimize,
+            method="SLSQP")``. It supports parameters with up to 1000 entries in total.
         steps: number of iterations. Default: ``iterations`` of the problem's job, or 200.
         callbacks: functions that are called with an `Iteration` after each step; one that returns True stops the loop.
         progress: show a bar on a terminal, the loss curve and images in a notebook, or lines elsewhere.
@@ -106,7 +107,7 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         **settings: further keys of a job, such as ``checkpoint_every``, ``preview`` or ``spp`` (docs/job-reference.md).
 
     Returns:
-        Values and history, and why the run ended early, if so. The first Ctrl-C ends it after the current iteration.
+        Values, history and the reason of an early end. The first Ctrl-C ends the run after the current iteration.
 
     Raises:
         PathreplayError: settings are invalid, loss or values are not finite, or the folder is in use, damaged, or
@@ -134,7 +135,7 @@ def _minimized(
     output: Path | None,
     resume: bool,
 ) -> Result:
-    """Run `minimize` for a problem with settings (``built``) and the user's optimizer, if any (``own``)."""
+    """Run `minimize`. ``built`` is the problem with its settings, and ``own`` the user's optimizer, if any."""
     stop = Stop()
     if built.config.executor != "local" and problem.in_memory:
         raise PathreplayError(

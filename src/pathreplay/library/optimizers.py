@@ -68,7 +68,7 @@ class OfMitsuba:
         return {}
 
     def state(self) -> State:
-        """See `Optimiser`. The arrays are Dr.Jit's state except values and learning rates, numbered per variable."""
+        """See `Optimiser`. The arrays are Dr.Jit's additional state per variable, such as moments, named NUMBER:KEY."""
         kept = {key: _leaves(self._optimizer.state[key][3:]) for key in self._steps}
         arrays = {f"{n}:{key}": np.array(leaf) for key, leaves in kept.items() for n, leaf in enumerate(leaves)}
         return State(dict(self._steps), arrays)
@@ -110,7 +110,7 @@ class OfUser:
     finished = ""
 
     def __init__(self, stepper: Stepper, values: Arrays) -> None:
-        self._stepper: Any = stepper  # it may have state_dict() and load_state_dict(), too
+        self._stepper: Any = stepper  # Any, because state_dict() and load_state_dict() are optional
         self._steps = dict.fromkeys(values, 0)
 
     def step(
@@ -173,10 +173,10 @@ def _rated(problem: Problem) -> set[str]:
 
 
 def options_of(optimizer: object) -> tuple[Json | None, object]:
-    """Return the options of the job's ``optimizer``, and the user's optimizer object or search function.
+    """Split the argument ``optimizer`` of `minimize` into options of a job and an object of the user.
 
-    Either is None if it does not apply. A search function also has options, with the type of search methods. Raises
-    PathreplayError for any other object.
+    The object is None for a name, a mapping or None. The options are None for an optimizer object or None. A function
+    gets the options of ``l-bfgs-b``. Raises PathreplayError for any other argument.
     """
     if optimizer is None or isinstance(optimizer, str):
         return None if optimizer is None else {"type": optimizer}, None
@@ -187,7 +187,7 @@ def options_of(optimizer: object) -> tuple[Json | None, object]:
     if hasattr(optimizer, "step"):
         return None, optimizer
     if callable(optimizer):
-        return {"type": "l-bfgs-b"}, optimizer  # jobs treat all search methods like this type
+        return {"type": "l-bfgs-b"}, optimizer  # jobs treat every function like this type
     raise PathreplayError(
         f"optimizer: {type(optimizer).__name__} has no step(); give a name such as 'adam', an optimizer of "
         "mitsuba.ad, an object with step(values, gradients, learning_rates, loss), or a function like "

@@ -31,7 +31,7 @@ from pathreplay.scenes.loading import load_scene_for
 from pathreplay.types import Json
 
 MOST_ITERATIONS = 10**6
-"""Iterations of a problem that is not part of a run. Every iteration at which a grid is refined is smaller."""
+"""``iterations`` of a problem that is not part of a run, large enough for any ``refine_at``."""
 OF_A_PROBLEM = frozenset(
     "scene scene_parameters sensors test_views variant integrator baseline parameters derived capture exposure "
     "view_weights target loss learning_rate deterministic memory_limit".split()
@@ -47,9 +47,9 @@ class Problem:
     differentiated.
 
     Args:
-        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. Unless the scene
-            is already loaded, `dielectric_ad` replaces each ``dielectric`` if an index is a parameter, and 8-bit
-            textures that are parameters are loaded as floating-point numbers.
+        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. A loaded scene is
+            used unchanged. In any other scene, `dielectric_ad` replaces each ``dielectric`` if an index of refraction
+            is a parameter. 8-bit textures that are parameters are loaded as floating-point numbers.
         parameters: options by parameter key of ``mi.traverse(scene)`` or glob, or a sequence of keys without options.
         views: sensors and their targets.
         loss: a name (see `pathreplay.losses`), or ``loss(image, target)`` on tensors of shape (height, width, channels)
@@ -284,11 +284,14 @@ def _loaded(scene: object, job: Json, base: Path) -> tuple[mi.Scene, tuple[str, 
 
 
 def _moved(job: Json, scene: mi.Scene, views: Sequence[View] | None) -> Targets | None:
-    """Change a job so that its scene is in memory and, if there are ``views``, its targets; return these targets."""
+    """Change a job so that its scene is in memory. Without ``views``, return None.
+
+    Otherwise the views replace the job's sensors and targets, and the new targets are returned.
+    """
     said, job["scene"] = job.get("scene"), IN_MEMORY
     if views is None:
         if "images" not in job.get("target", {}) and "capture" not in job:
-            job["target"] = {"scene": said, **job.get("target", {})}  # the file's own scene still renders the targets
+            job["target"] = {"scene": said, **job.get("target", {})}  # targets are still rendered from the file's scene
         return None
     named = by_name(scene, views)
     job.pop("capture", None)

@@ -22,7 +22,7 @@ from pathreplay.library.problem import Problem, run_settings
 
 
 class _Task:
-    """Settings and kernels that all states of an optimisation share, and an optimiser in sync with the state ``at``."""
+    """Settings, kernels and one optimiser for all states. The optimiser's internal state is that of ``at``."""
 
     def __init__(self, changes: Mapping[str, object]) -> None:
         self._changes = changes
@@ -46,7 +46,7 @@ class _Task:
         if self.optimiser is None or self.at is not state:
             self.optimiser = self.own or optimiser_of(built, state._next, built.config.optimizer)
             self.optimiser.restore(state._kept, latents(built.variables, state._next))
-        self.at = None  # in sync with no state until the step has succeeded
+        self.at = None  # until the step has succeeded, the optimiser fits no state
         return self.optimiser
 
 

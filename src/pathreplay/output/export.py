@@ -73,7 +73,7 @@ def export_run(run: Path, output: Path | None = None) -> str:
             (part / name).write_bytes(data)
         require_same(export.scene, part)
     files = sorted([*export.files, *export.copies])
-    # The command `mitsuba` would load the system's newest LLVM, and some versions of LLVM crash Mitsuba.
+    # Do not suggest the command `mitsuba`: it loads the system's newest LLVM, and some versions of LLVM crash Mitsuba.
     render = f"pathreplay render {shlex.quote(str(folder / SCENE))} -o scene.exr --variant {mi.variant()}"
     lines = [f"{folder / SCENE}: render it with `{render}`"]
     lines += [f"{folder / name}" for name in files if name != SCENE and not name.startswith("files/")]
@@ -105,7 +105,7 @@ def _result(run: Path) -> dict[str, np.ndarray]:
         values = safetensors.numpy.load_file(str(path))
     except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise PathreplayError(f"Result {path} cannot be read ({error}); resume the run, which writes it") from None
-    # Omit translation and rotation of poses: the resulting transform or vertices have a separate key.
+    # Omit the translation and rotation of poses, whose resulting transform or vertices have a key of their own.
     return {k: v for k, v in values.items() if not k.endswith(PART_NAMES)}
 
 
@@ -129,7 +129,7 @@ def _source(job: Job, values: Arrays) -> Source:
 
 
 def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
-    """Return the 8-bit image files whose textures the run has optimized, and stored as floating-point numbers."""
+    """Return the 8-bit image files of optimized textures, which the run has loaded as floating-point numbers."""
     keys = [key for key in values if key.endswith(".data")]
     if not keys:
         return ()
@@ -142,7 +142,7 @@ def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
 def _beside(export: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
     """Return the content of the files that the scene does not reference, by name: PNG, OBJ, NPY, cameras, and numbers.
 
-    ``free`` are parameters outside the scene; if they have more than 16 numbers, they become NPY files.
+    ``free`` are parameters outside the scene. Each with more than 16 numbers becomes an NPY file.
     """
     params, files = mi.traverse(export.scene), {"transforms.json": _json(_cameras(export.scene))}
     names = file_names([*params.keys(), *(shape.id() for shape in export.scene.shapes())])

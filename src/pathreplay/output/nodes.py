@@ -1,4 +1,4 @@
-"""Parses a scene description for writing into objects, and finds the object that each parameter belongs to.
+"""Parses a scene description into objects that can be edited, and finds the object that each parameter belongs to.
 
 Parameters have the keys of `mi.traverse(scene)`, whereas the parser knows objects and their properties. To relate
 parameters to objects, the scene is instantiated once with a unique id per object. The id of the instance that has a
@@ -27,7 +27,7 @@ Node: TypeAlias = "mi.parser.SceneNode"
 
 @dataclass(frozen=True)
 class Owner:
-    """The object that a parameter belongs to, and the path of the parameter in it, as 'reflectance.value' or 'data'."""
+    """The object of a parameter, and the parameter's path within the object, such as 'reflectance.value' or 'data'."""
 
     node: Node
     place: str
@@ -130,7 +130,7 @@ def _join(state: mi.parser.ParserState, name: str, camera: mi.parser.ParserState
 
 def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes: list[Node]) -> list[Owner]:
     """Return the owners of all parameters, from an instance of the scene in which each object has a unique id."""
-    copy = mi.parser.ParserState(state)  # because instantiation replaces references by objects
+    copy = mi.parser.ParserState(state)  # instantiation would replace references by objects
     names = {f"object {i}": i for i in range(1, len(nodes))}
     for name, i in names.items():
         copy.nodes[i].props.set_id(name)
@@ -148,15 +148,15 @@ def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes:
 
 
 def _deepest(described: Described, owner: Owner) -> Owner:
-    """Follow the place of a parameter to the innermost object.
+    """Return the innermost object that has the parameter, by following the parameter's path from ``owner``.
 
-    `_owners` misses some objects: for example, the instance of a bitmap does not keep its id.
+    `_owners` may find only an outer object: for example, the instance of a bitmap does not keep its id.
     """
     name, dot, rest = owner.place.partition(".")
     if not dot:
         return owner
     children = dict(described.children(owner.node))
-    if name not in children:  # the file uses another property name; if only one child is a bitmap, it is meant
+    if name not in children:  # the property has another name in the file: take the only bitmap
         pictures = [child for child in children.values() if child.props.plugin_name() == "bitmap"]
         if rest.split(".")[-1] != "data" or len(pictures) != 1:
             return owner

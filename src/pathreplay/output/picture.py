@@ -24,7 +24,7 @@ from pathreplay.scenes.descriptions import errors_as
 _A_PASS = 2**24
 # Bytes per sample during a pass, for two copies of the state of its random number generator.
 _A_SAMPLE = 64
-# Pixels. A larger size is probably a typing error, for which Mitsuba at best raises an error.
+# Largest width and height in pixels. A larger size is probably a typo, for which Mitsuba raises an error at best.
 _LARGEST_SIDE = 2**16
 
 Told = Callable[[int, int], None]
@@ -35,7 +35,7 @@ Told = Callable[[int, int], None]
 class Rendering:
     """A rendered image with linear pixels (height, width, channels).
 
-    The names of the ``channels`` are R, G, B, A and Y, or those of AOVs.
+    ``channels`` are the names of the channels: R, G, B, A or Y for colours, and the names of AOVs.
     """
 
     image: Image
@@ -87,8 +87,8 @@ def set_size(sensor: mi.Sensor, size: str) -> None:
 def passes(sensor: mi.Sensor, spp: int) -> list[int]:
     """Return the samples per pixel of each pass. Their sum is ``spp``, or more if the sampler rounds up.
 
-    Samplers other than `independent` stratify the samples of a pixel. Their samples are split only if Dr.Jit or the
-    memory cannot hold all samples at once. Each of these passes has a power of four samples per pixel, which all
+    Samplers other than `independent` stratify the samples of a pixel. Such samples are split into passes only if Dr.Jit
+    or the memory cannot hold all samples at once. Each pass then has a power of four samples per pixel, which all
     samplers accept.
 
     Raises PathreplayError if the image does not fit into memory.
@@ -132,7 +132,7 @@ def render(
     names = tuple(field.name for field in sensor.film().bitmap().struct_())
     picture = (total / done).astype(np.float32)
     picture = picture[:, :, None] if picture.ndim == 2 else picture
-    # If the integrator returns only AOVs, the image lacks the colour channels that the film has.
+    # The film lists colours before AOVs. If the integrator returns only AOVs, these have the last names.
     return Rendering(picture, names[len(names) - picture.shape[2] :], done)
 
 

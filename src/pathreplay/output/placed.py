@@ -18,7 +18,7 @@ from pathreplay.scenes.volume_files import UNIT_CUBE, Bounds, vol_bounds, vol_by
 _PICTURES = ("bitmap", "envmap")
 _OF_A_MESH = ("vertex_", "faces", "face_")
 _MADE_BY = ("filename", "bitmap", "grid", "data", "shape_index")
-"""Properties that define the source of the values of a texture, a grid or a mesh."""
+"""Properties that say where the values of a texture, grid or mesh come from."""
 _ALSO_PLACES = {
     "sphere": ("center", "radius"),
     "cylinder": ("p0", "p1", "radius"),
@@ -27,7 +27,7 @@ _ALSO_PLACES = {
 }
 """Properties by plugin that `mi.traverse` includes in `to_world`."""
 
-# Plugin and only property of each class of materials and emitters that an existing mesh object may have.
+# The classes that are supported as material or emitter of an existing mesh object: plugin and its only property.
 _KNOWN = {"SmoothDiffuse": ("diffuse", "reflectance"), "AreaLight": ("area", "radiance")}
 _PLAIN_SPECTRA = ("SRGBReflectanceSpectrum", "UniformSpectrum")
 
@@ -62,7 +62,7 @@ class Placing:
             self._number(key, node, place)
 
     def meshes(self) -> None:
-        """Replace mesh objects in the description by files, and their materials and emitters by properties."""
+        """Write existing mesh objects to files, and describe the meshes, their materials and emitters by properties."""
         for parent in list(self.described.nodes):
             for name in list(parent.props.keys()):
                 value = parent.props.get(name) if parent.props.type(name) == mi.Properties.Type.Object else None
@@ -93,7 +93,7 @@ class Placing:
         if grid is None:
             grid = mi.VolumeGrid(str(self.described.find_file(node.props.get("filename"))))
         stream = mi.MemoryStream()
-        grid.write(stream)  # the box is only accessible in Python as a part of the file
+        grid.write(stream)  # Python can read the bounding box only from a written file
         return vol_bounds(stream.raw_buffer())
 
     def _mesh(self, mesh: mi.Mesh, node: Node) -> None:
@@ -126,9 +126,9 @@ class Placing:
         parent.props[name] = self.described.add(properties, mi.ObjectType.Shape)
 
     def _known(self, instance: mi.Object, what: str) -> mi.Properties:
-        """Return properties that describe an existing object, for classes whose parameters determine the object.
+        """Describe an existing material or emitter by properties.
 
-        Raises PathreplayError for other classes.
+        Raises PathreplayError unless the object is a diffuse material or an area light, of constant colour.
         """
         plugin, part = _KNOWN.get(instance.class_name(), ("", ""))
         params = mi.traverse(instance)
@@ -193,7 +193,7 @@ def made_otherwise(node: Node) -> bool:
 
 
 def copied_files(described: Described, placed: dict[str, bytes]) -> dict[str, Path]:
-    """Return the files that the scene references, except those in ``placed``: paths by new name.
+    """Return the paths of the files that the scene references, by new name. Files in ``placed`` are omitted.
 
     The new names replace the old names in the description.
     """

@@ -82,7 +82,7 @@ def render_to_file(scene: str, output: Path, asked: RenderOptions, progress: boo
 
 
 def _flat(option: str, table: Json, changes: Sequence[str]) -> Json:
-    """Return the table with each NAME=VALUE added. Raises PathreplayError for nested values."""
+    """Return the table with the given NAME=VALUE entries added. Raises PathreplayError if a value is nested."""
     result = defined(table, changes, option)
     for name, value in result.items():
         if isinstance(value, (dict, list)):

@@ -36,7 +36,7 @@ _STANDS_IN = {"dielectric_ad": "dielectric"}
 _DEPTHS = {"direct_projective": 2} | dict.fromkeys(
     ("pathreplay", "prb", "prb_basic", "prb_projective", "rb", "prbvolpath"), 6
 )
-"""Default depths of the differentiable integrators, which `path` or `volpath` replaces in exported scenes."""
+"""Differentiable integrators and their default depths. Exported scenes have `path` or `volpath` instead."""
 _KEPT = ("max_depth", "rr_depth", "hide_emitters")
 """Properties that `path` and `volpath` share with differentiable integrators."""
 
@@ -140,13 +140,13 @@ def _alike(value: object, other: object) -> bool:
     try:
         a, b = (_numbers(x) for x in (value, other))
     except (TypeError, ValueError):
-        return True  # not comparable, for example scalar vectors, which are never recovered
+        return True  # not numeric, such as scalar vectors, which no run optimizes
     if a.size == 0 or b.size == 0:
         return a.size == b.size
     a, b = (x.astype(np.float64).ravel() for x in (a, b))
     a, b = (
         np.full(max(a.size, b.size), x[0]) if x.size == 1 else x for x in (a, b)
-    )  # a grey colour is a single number
+    )  # a grey colour may be a single number
     return a.shape == b.shape and np.allclose(a, b, rtol=1e-5, atol=1e-6 * (1 + np.abs(a).max()))
 
 

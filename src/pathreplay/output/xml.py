@@ -1,7 +1,7 @@
 """Writes a scene description as Mitsuba XML with exact numbers and preserved ids.
 
 Mitsuba's own writer (`mi.parser.write_file`) decomposes transforms into angles, omits the ids of objects without
-references, and replaces sizes by defaults.
+references, and replaces film sizes and sample counts by variables such as ``$resx``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,11 @@ def scene_xml(described: Described, from_file: bool) -> bytes:
 
 
 class _Names:
-    """The ids of objects in the XML file. Only objects that are referenced or part of parameter keys have an id."""
+    """The ids of objects in the XML file.
+
+    Objects that are used more than once have an id. Objects that the user has named keep their ids: all of them in a
+    file, and in a dictionary only those whose names are part of parameter keys.
+    """
 
     def __init__(self, described: Described, uses: Counter[int], from_file: bool) -> None:
         top = {id(child) for _, child in described.children(described.nodes[0])}

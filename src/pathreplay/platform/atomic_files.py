@@ -73,7 +73,7 @@ def write_whole(path: Path, data: bytes, option: str) -> None:
 def whole_folder(path: Path, option: str) -> Iterator[Path]:
     """Yield a temporary folder, which is renamed to ``path`` at the end of the block, or removed if the block raises.
 
-    Raises PathreplayError if ``path`` exists and is not an empty folder, or cannot be written.
+    Raises PathreplayError if ``path`` cannot be written, or exists and is not an empty folder.
     """
     if os.path.lexists(path) and not (path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
         raise PathreplayError(f"{path} exists already; give {option} a new folder")

@@ -43,7 +43,7 @@ def point_drjit() -> None:
 
 
 def _known_problem(path: str) -> str:
-    """Return why a libLLVM cannot work, without a test: its version is too old, or it cannot be loaded; else ""."""
+    """Return a reason why a libLLVM cannot work, or "". The library is loaded, but not tested."""
     version = llvm.version_in_path(os.path.realpath(path))
     if version and version < (OLDEST_USABLE_MAJOR,):
         return f"LLVM {version[0]} is refused by Dr.Jit or aborts the process"
@@ -126,7 +126,8 @@ def warn_of_bad_llvm() -> None:
 def ensure_llvm() -> None:
     """Ensure that Dr.Jit's LLVM back end works in this process.
 
-    Pip's library is not tested once it is loaded. Any other library is tested (0.3 s), and replaced if the test fails.
+    If Dr.Jit has loaded pip's library, no test is made. Any other library is tested (0.3 s), and replaced if the test
+    fails.
 
     Raises PathreplayError if no library works, or if the loaded library can no longer be replaced.
     """

@@ -1,4 +1,4 @@
-"""The device that runs kernels: local memory per lane, total memory, and order of additions.
+"""The device that runs kernels: its local memory per lane, its total memory, and the order of its additions.
 
 On LLVM, the lanes of one vector packet per thread run at the same time, and local memory is part of each thread's
 stack. A GPU reserves local memory for every thread that can be resident, whatever the launch size. For example, 2048
@@ -24,8 +24,8 @@ LARGEST_LOCAL = 56 * 1024
 """Largest number of bytes of local memory per CUDA thread. OptiX provides a stack of 64 KiB, and crashes the process if
 the stack overflows. A record of 560 x 96 bytes fits; a record of 700 x 96 bytes does not."""
 FEWEST_RECORDS = 9
-"""Smallest number of records allocated on a GPU. Arrays of up to eight entries are kept in registers, where dynamic
-indexing makes a pass more than twice as slow."""
+"""Smallest number of records that are allocated on a GPU. Arrays of up to eight entries would be kept in registers.
+Dynamic indexing of registers makes a pass more than twice as slow."""
 
 # CUDA device attributes.
 _MULTIPROCESSORS, _THREADS_EACH = 16, 39
@@ -50,7 +50,7 @@ class Device:
 
     @property
     def keeps_order(self) -> bool:
-        """Whether a single thread adds in a reproducible order. On a GPU the order is random."""
+        """Whether the order of additions is reproducible if a single thread is used. On a GPU the order is random."""
         return not self.is_gpu
 
     def local_bytes(self) -> int | None:
@@ -61,12 +61,12 @@ class Device:
         return min(LARGEST_LOCAL, int(SHARE * self.memory) // self.lanes) if known else LARGEST_LOCAL
 
     def most_records(self, size: int, otherwise: int) -> int:
-        """Return the largest number of records of ``size`` bytes per lane, at most ``otherwise``."""
+        """Return how many records of ``size`` bytes a lane can store in its local memory, at most ``otherwise``."""
         room = self.local_bytes()
         return otherwise if room is None else min(otherwise, room // size)
 
     def room(self, records: int) -> int:
-        """Return the number of records to allocate if ``records`` are needed."""
+        """Return the number of records to allocate if ``records`` are needed: on a GPU at least `FEWEST_RECORDS`."""
         return max(records, FEWEST_RECORDS) if self.is_gpu else records
 
 
@@ -104,13 +104,13 @@ def _cuda_device() -> Device:
 
 
 def available(variant: str) -> int:
-    """Return the bytes available for rendering: the machine's free memory, on a GPU at most the device's memory."""
+    """Return the bytes available for rendering: the free main memory, and on a GPU at most the total GPU memory."""
     device, left = device_of(variant), memory.available()
     return min(left, device.memory) if device.memory else left
 
 
 def require_order(variant: str) -> None:
-    """Raise PathreplayError if a variant adds in random order."""
+    """Raise PathreplayError if the device of a variant performs additions in random order."""
     if not device_of(variant).keeps_order:
         raise PathreplayError(
             f"deterministic = true needs an LLVM variant, this is '{variant}': on a GPU the order of additions "

@@ -21,7 +21,7 @@ _raised_at: list[float] = []  # time at which a signal handler last raised an ex
 
 
 def raise_once(error: BaseException) -> None:
-    """Raise ``error``, unless a signal handler has just raised an exception, which may still be propagating."""
+    """Raise ``error`` unless this function has raised an exception within `ONE_WISH_S`, which may still propagate."""
     now = time.monotonic()
     if _raised_at and now - _raised_at[-1] < ONE_WISH_S:
         return
@@ -68,9 +68,10 @@ def handled(
 
 @contextmanager
 def raised() -> Iterator[None]:
-    """Make each signal raise `Interrupted` within this block, even if a library converts the exception.
+    """Make each signal raise `Interrupted` within this block.
 
-    After a signal, the handlers stay in place until the process ends, so that further signals cannot kill it.
+    If a library converts this exception to another, the block still raises `Interrupted`. After a signal, the handlers
+    stay in place until the process ends, so that further signals cannot kill it.
     """
     numbers: list[int] = []
 
@@ -82,7 +83,7 @@ def raised() -> Iterator[None]:
         try:
             yield
         except (RuntimeError, ImportError, SystemError):
-            if numbers:  # Dr.Jit converts exceptions raised during tracing
+            if numbers:  # Dr.Jit has converted `Interrupted`, raised while Dr.Jit was tracing
                 raise Interrupted(numbers[0]) from None
             raise
 
@@ -137,6 +138,6 @@ def stopping(say: Callable[[str], None], remedy: str, stop: Stop | None = None) 
         try:
             yield stop
         except (RuntimeError, PathreplayError):
-            if stop.aborted:  # Dr.Jit converts exceptions raised during tracing
+            if stop.aborted:  # Dr.Jit has converted the KeyboardInterrupt, raised while Dr.Jit was tracing
                 raise KeyboardInterrupt(remedy) from None
             raise

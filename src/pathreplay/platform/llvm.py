@@ -127,7 +127,7 @@ def system_libraries() -> list[str]:
 def candidates() -> Iterator[tuple[str, str]]:
     """Yield (path, origin) of each libLLVM to test, in order of preference, each file once."""
     pip = pip_library() or ""
-    # A subprocess inherits the variable that the parent set to pip's library; the origin of this library is still pip.
+    # In a subprocess, the variable may name pip's library because the parent has set it: the origin is still pip.
     named = ((ASKED_FOR, "pip" if ASKED_FOR == pip else ENVIRONMENT_VARIABLE), (pip, "pip"))
     seen = {""}
     for path, origin in (*named, *((path, "system") for path in system_libraries())):
@@ -172,7 +172,7 @@ def unlinked_siblings(path: str) -> list[str]:
 
     At the first start of Python after installation, the wheel creates the links libc++.so.1 -> libc++.so.1.0 and two
     more. The links are missing if the folder is not writable. Loading the files before libLLVM then has the same
-    effect, because the loader matches the names stored inside them.
+    effect as the links, because the loader matches the names that are stored in the files.
     """
     folder = Path(path).parent / "x86_64-unknown-linux-gnu"
     files = [folder / name for name in ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")]
@@ -182,7 +182,7 @@ def unlinked_siblings(path: str) -> list[str]:
 
 def _reason(returncode: int, stderr: str) -> str:
     """Return a one-line reason for the failure of a test, from exit status and standard error of the subprocess."""
-    # Dr.Jit reports that the kernel cache is disabled, which `probe` does on purpose.
+    # Ignore Dr.Jit's message that the kernel cache is disabled: `probe` disables the cache on purpose.
     messages = [line.strip() for line in stderr.splitlines() if line.strip() and "kernel cache" not in line]
     lines = [re.sub(r"^\w+\(\): ", "", line) for line in messages] or [""]
     crash = returncode < 0 and returncode != -signal.SIGTERM

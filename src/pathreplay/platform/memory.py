@@ -29,7 +29,7 @@ def available() -> int:
     left = int(psutil.virtual_memory().available)
     for limit, used, statistics in _CONTAINERS:
         try:
-            # Cached files count as used by a container, but are evicted when memory is needed.
+            # The usage of a container includes cached files, but their memory is available: it is freed when needed.
             cached = dict(re.findall(r"^(?:total_)?((?:in)?active_file) (\d+)$", statistics.read_text(), re.MULTILINE))
             left = min(left, int(limit.read_text()) - int(used.read_text()) + sum(map(int, cached.values())))
         except (OSError, ValueError):  # no such group, or 'max' (no limit)

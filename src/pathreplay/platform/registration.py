@@ -49,7 +49,7 @@ def register(variant: str, plugins: Plugins = PLUGINS) -> None:
 
 
 def mitsuba_integrator() -> Any:
-    """Return Mitsuba's ADIntegrator of the active variant, whose setup of a pass interprets seeds as Mitsuba does."""
+    """Return Mitsuba's ADIntegrator of the active variant. Its `prepare` seeds the sampler of a pass as in Mitsuba."""
     # Mitsuba executes this module again for every variant. An import from the public `mitsuba.ad` would create a copy
     # that stays bound to the first variant.
     from mitsuba.python.ad.integrators.common import ADIntegrator
@@ -58,10 +58,10 @@ def mitsuba_integrator() -> Any:
 
 
 def on_base(template: type, base: type) -> type:
-    """Build the class that a template describes, on a base class of Mitsuba.
+    """Build a class that has the attributes of a template and inherits from a base class of Mitsuba.
 
-    Each variant has its own base class. A template is defined before any base class and cannot inherit from one. Its
-    methods call base methods through the base class.
+    Each variant has its own base class. A template is defined before Mitsuba has a variant, and cannot inherit from a
+    base class. Its methods call base methods by the name of the class, such as ``mi.BSDF.__init__(self, props)``.
     """
     parts = [vars(part) for part in reversed(template.__mro__[:-1])]
     body = {name: value for part in parts for name, value in part.items() if name not in ("__dict__", "__weakref__")}

@@ -1,6 +1,6 @@
-"""Parameters of a scene or object, without parameters whose value is None.
+"""Traverses a scene or object, without the parameters whose value is None.
 
-For example, ``sigma_a`` of hair with ``eumelanin`` is None, and Mitsuba raises a TypeError when it is read.
+For example, ``sigma_a`` of hair with ``eumelanin`` is None, and Mitsuba raises a TypeError when ``sigma_a`` is read.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def traversed(thing: mi.Object) -> mi.SceneParameters:
 
 
 def known_values(params: mi.SceneParameters) -> Iterator[tuple[str, Any]]:
-    """Yield the parameters with their values, for reading only: `params.update` does not notice changes in place."""
+    """Yield keys and values other than None. Do not change the values: `params.update` would not notice a change."""
     for key, (value, kind, node, _) in params.properties.items():
         current = value if kind is None else params.get_property(value, kind, node)
         if current is not None:

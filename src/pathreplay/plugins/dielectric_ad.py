@@ -11,11 +11,11 @@ probability of reflection is F, as in Mitsuba, with one exception. For rays from
 angle, transmission is sampled with a probability of at least 1/4. Near the critical angle dF is unbounded, and samples
 with the small probability 1 - F would contribute nearly all of the derivative.
 
-Differentiated: wo and the weight with respect to `eta` and si.wi, and the weight with respect to the tints. *Not*
-differentiated: the probability of choosing a lobe, and the onset of total internal reflection. bs.pdf is detached, and
-the weight is f / detach(pdf). The value of the weight is therefore the tint (times s), while its derivative contains
-the Fresnel term. F is continuous at the onset of total internal reflection. An edge of the scene that is seen through
-the lobe is a boundary term of the integrator.
+The direction wo and the weight are differentiated with respect to `eta` and si.wi. The weight is also differentiated
+with respect to the tints. The probability of choosing a lobe and the onset of total internal reflection are *not*
+differentiated (F is continuous at the onset). bs.pdf is detached, and the weight is f / detach(pdf). The value of the
+weight is therefore the tint (times s), while its derivative contains the Fresnel term. If an edge of the scene is seen
+through a lobe, the motion of the edge is a boundary term, which belongs to the integrator.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def _index(props: mi.Properties, name: str, default: str) -> float:
 class DielectricAD:
     """A smooth dielectric whose index of refraction is differentiable; a template, see `on_base`."""
 
-    specular_reflectance: mi.Texture | None  # None stands for 1, and nothing is evaluated
+    specular_reflectance: mi.Texture | None  # None: the tint is 1, and no texture is evaluated
     specular_transmittance: mi.Texture | None
 
     def __init__(self, props: mi.Properties) -> None:
@@ -81,7 +81,7 @@ class DielectricAD:
                 cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        dr.make_opaque(self.eta)  # a literal would become a kernel constant, and every update would recompile
+        dr.make_opaque(self.eta)  # a literal is a kernel constant: every update would recompile the kernel
 
     def to_string(self) -> str:
         lines = [f"  eta = {self.eta},"]
@@ -121,7 +121,7 @@ class DielectricAD:
         if has_r and has_t:
             bs.pdf = dr.select(selected_r, p_r, 1 - p_r)
             weight = f / bs.pdf
-            # If p_r is not clamped, the quotient is 1 up to rounding, or 0 / 0 where the probability is zero.
+            # If p_r is not clamped, f / pdf is 1 up to rounding, or 0 / 0 where the probability is zero: use 1.
             weight = dr.replace_grad(dr.select(p_r == F, 1, weight), weight)
         else:
             bs.pdf = mi.Float(1)

@@ -22,14 +22,14 @@ from pathreplay.plugins.supergrid import Bounds
 
 T = TypeVar("T")
 
-#: Rate of residual collisions relative to the largest residual density. A factor of two halves the exponent of the
-#: variance. A factor of four costs more time than the lower noise saves (`pathreplay bench gridmedium`).
+#: Rate of residual collisions relative to the largest residual density. The value 2 halves the exponent in the variance
+#: (see `control`). The value 4 costs more time than the lower noise saves (`pathreplay bench gridmedium`).
 DENSER = 2.0
 #: Largest value of ∫ (σ - c)²/m ds over one cell, if σ is the lowest density of the cell along the whole ray. This
 #: integral is about the relative variance that the cell adds to the transmittance (see `control`). A ray crosses 10 to
 #: 50 cells. With the mean as control density in all cells, dense grids with sharp edges produce extreme outliers.
 RISK = 0.1
-#: Russian roulette is applied to estimates below this value. It adds a variance of at most FAINT times the
+#: Russian roulette is applied to estimates below this value. The roulette adds a variance of at most FAINT times the
 #: transmittance.
 FAINT = 1e-2
 
@@ -38,9 +38,9 @@ FAINT = 1e-2
 class Cells:
     """A lookup table of values per cell.
 
-    One layer of empty cells surrounds the grid, because rounding may move a ray one cell too far. ``to_cell`` (3 x 4)
-    maps world space to cell space, and ``shape`` is the number of cells along x, y, z. Both include the layer.
-    ``table`` (Float, flat) contains the same number of values for every cell, with x varying fastest.
+    One layer of empty cells surrounds the grid, because rounding may move a ray one cell too far. This layer is
+    included in ``shape``, the number of cells along x, y, z. ``to_cell`` (3 x 4) maps world space to cell space, where
+    the layer begins at 0. ``table`` (Float, flat) contains the same number of values per cell, with x varying fastest.
     """
 
     to_cell: NDArray[np.float64]
@@ -111,7 +111,7 @@ class CellWalk:
     inverse: mi.Vector3f  # 1/d; 0 for axes perpendicular to the ray
     offset: mi.Vector3f  # ([d > 0] - o)/d; infinite for axes perpendicular to the ray
     stride: mi.Vector3f  # the step from cell to cell, ±1
-    start: mi.Vector3f  # the cell at the first distance
+    start: mi.Vector3f  # the cell in which the traversal starts
     end: mi.Float  # the distance at which the traversal ends
 
     def crossing(self, cell: mi.Vector3f) -> mi.Vector3f:
@@ -131,7 +131,7 @@ def begin(cells: Cells, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> CellWalk:
     offset = dr.select(still, dr.inf, (dr.select(forward, mi.Vector3f(1), mi.Vector3f(0)) - o) * inverse)
     inner = mi.Vector3f([n - 2 for n in cells.shape])
     start = dr.clip(dr.floor(dr.fma(d, a, o)), 1, inner)
-    # The far side of the last inner cell limits the end. It is computed with the same rounding as in the traversal.
+    # The ray ends at the far side of the last inner cell at the latest. The rounding is the same as in the traversal.
     last = dr.fma(dr.select(forward, inner, mi.Vector3f(1)), inverse, offset)
     stride = dr.select(forward, mi.Vector3f(1), mi.Vector3f(-1))
     return CellWalk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))
@@ -194,9 +194,9 @@ def free_flight(
 def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Compute control density c and residual collision rate m per cell, for the density ``scale`` times the volume.
 
-    The relative variance of the estimate is exp(∫ (σ - c)²/m ds) - 1. On average, the mean density is the best control.
-    However, a ray may meet only the lowest density of the cell, and (σ - c)²/m is then large in a dense cell. c is
-    therefore limited, so that the integral over such a part of one cell does not exceed RISK.
+    The relative variance of the transmittance is exp(∫ (σ - c)²/m ds) - 1. On average, it is lowest if c is the mean
+    density. However, a ray may pass only through the lowest density of a cell, and (σ - c)²/m is then large in a dense
+    cell. c is therefore limited, so that the integral over such a ray in one cell does not exceed RISK.
     """
     lowest, highest = _scaled(bounds, scale)
     length = 2 / bounds.faces_per_length  # twice the mean length of a ray in a cell
@@ -206,7 +206,7 @@ def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
 
 
 def majorants(bounds: Bounds, scale: mi.Float) -> mi.Float:
-    """Return an upper bound of the density per cell, at least 0; an optimiser may make densities negative."""
+    """Return an upper bound of the density per cell. Negative bounds, which optimisers may cause, are set to 0."""
     return dr.fmax(_scaled(bounds, scale)[1], 0)
 
 

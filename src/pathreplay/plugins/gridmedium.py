@@ -1,4 +1,4 @@
-"""`gridmedium`: Mitsuba's `heterogeneous` with differentiable scale, emission, and majorants that follow the grid.
+"""`gridmedium`: Mitsuba's `heterogeneous` with emission, a differentiable scale, and local majorants.
 
 With V, A and Q the volumes `sigma_t`, `albedo` and `emission`, and s the `scale`,
 
@@ -7,9 +7,9 @@ With V, A and Q the volumes `sigma_t`, `albedo` and `emission`, and s the `scale
 Mitsuba's integrators use a global majorant and ignore the emission. The integrators of this package call `free_flight`
 (local majorants), `transmittance` (residual ratio tracking) and `emission_at`.
 
-The coefficients and the emission are differentiable with respect to V, A, Q, s and the position. *Not* differentiated:
-majorants, free-flight distances and the transmittance estimate (all detached), the bounding box and `to_world` of
-volumes.
+The coefficients and the emission are differentiable with respect to V, A, Q, s and the position. Majorants, free-flight
+distances and the transmittance estimate are detached. The bounding box and the `to_world` of volumes are *not*
+differentiated.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from pathreplay.plugins.supergrid import (
     voxel_bounds,
 )
 
-#: Half the side of the cube that a density given as a number fills. The value is larger than any scene, and far from
-#: overflow. Without a transform, a `constvolume` fills only the unit cube.
+#: Half the side of the cube that a `constvolume` fills if the density is given as a number. The value is larger than
+#: any scene, and far from overflow. Without a transform, a `constvolume` fills only the unit cube.
 FAR = 1e6
 
 
 class GridMedium:
     """A heterogeneous medium on grids, with local majorants; a template, see `on_base`."""
 
-    phase_function: Callable[[], mi.PhaseFunction]  # a method of Mitsuba's class
+    phase_function: Callable[[], mi.PhaseFunction]  # a method of `mi.Medium`
 
     def __init__(self, props: mi.Properties) -> None:
         mi.Medium.__init__(self, props)
@@ -72,7 +72,7 @@ class GridMedium:
     def parameters_changed(self, keys: list[str]) -> None:
         if keys and "sigma_t" not in keys and "scale" not in keys:
             return
-        dr.make_opaque(self.scale)  # a literal would become a kernel constant, and every update would recompile
+        dr.make_opaque(self.scale)  # a literal is a kernel constant: every update would recompile the kernel
         with dr.suspend_grad():
             if not keys or "sigma_t" in keys:
                 self.box = self.sigma_t.bbox()
@@ -83,7 +83,8 @@ class GridMedium:
     def _choose_cells(self) -> None:
         """Build tables of majorants and control densities for the current scale, each with the cheapest cell size."""
         scale = dr.detach(self.scale)
-        # With emission or gradients, empty cells need tentative collisions as well: one per mean chord of the box.
+        # Emission and the derivative of in-scattering are estimated at tentative collisions. For these estimates, empty
+        # cells also need tentative collisions: one per mean chord of the box.
         with dr.resume_grad():
             params = mi.traverse(self.sigma_t)
             moves = dr.grad_enabled(self.scale) or any(dr.grad_enabled(params[key]) for key in params.keys())
@@ -96,7 +97,7 @@ class GridMedium:
         dr.make_opaque(self.majorant)
 
     def _cheapest_cells(self, values: Sequence[tuple[mi.Float, ...]]) -> grid_traversal.Cells:
-        """Return the cells of the cheapest level. ``values`` has one tuple per level; its last entry is the rate."""
+        """Return the cells of the cheapest level. ``values`` has a tuple per level, whose last entry is the rate."""
         rates = [dr.mean(numbers[-1]) for numbers in values]
         dr.eval(values, rates)
         last = len(values) - 1
@@ -200,7 +201,7 @@ def _choice(props: mi.Properties) -> bool | str:
 
 
 def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
-    """Return whether channels of the volume differ, and its bounds per cell, from the finest level to a single cell."""
+    """Return whether channels of a volume differ, and a list of levels of bounds, from the finest to a single cell."""
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]
     if volume.class_name() == "GridVolume":

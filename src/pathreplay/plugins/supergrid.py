@@ -162,8 +162,8 @@ def _channels(data: mi.TensorXf) -> Values:
         return 3 * (mi.TensorXf(data.array, data.shape[:3]),)
     channels = [data[..., k] for k in range(data.shape[3])]
     if len(channels) == 4:
-        # The channels are the three coefficients of a spectrum with values between 0 and 1, and a factor. Nothing but
-        # 0 and 1 is known to bound the spectrum.
+        # Three channels are the coefficients of a spectrum, whose values are only known to be between 0 and 1. The
+        # fourth channel is a factor.
         return dr.fmin(channels[3], 0), channels[3] * 0, channels[3]
     return reduce(dr.fmin, channels), reduce(operator.add, channels) / len(channels), reduce(dr.fmax, channels)
 
@@ -173,7 +173,7 @@ def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np
 
     With trilinear interpolation, a lookup uses the cell's own voxels and one more voxel on either side. A voxel outside
     the n voxels of the axis is replaced by the last voxel (clamp), the voxel at the other end (repeat), or the mirror
-    image. Short rows repeat their entries.
+    image. Short rows are filled with repetitions of their voxels.
     """
     rows = []
     for start in range(low, high, BASE):
@@ -189,7 +189,7 @@ def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np
 
 
 def _merged(values: Values, axis: int, near: NDArray[np.int64], inside: NDArray[np.int64]) -> Values:
-    """Merge values along one axis (x, y, z): extremes over the indices ``near``, means over the indices ``inside``."""
+    """Merge values along axis 0, 1 or 2 (x, y, z): extremes over the indices ``near``, means over those ``inside``."""
 
     def pool(value: mi.TensorXf, table: NDArray[np.int64], merge: Callable) -> mi.TensorXf:
         before = [slice(None)] * (2 - axis)

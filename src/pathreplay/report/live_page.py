@@ -1,8 +1,8 @@
 """Writes the live page of a run and its preview images, and reacts to the file that requests a stop.
 
-The folder ``previews`` contains the content of the page (``page.json``), images, and film frames with names of the form
-ITERATION-WHAT-NAME.webp. A run can be resumed without these files. A preview that cannot be written or rendered is
-omitted, and never ends a run.
+The folder ``previews`` contains the content of the page (``page.json``), the images of the page, and the frames of
+time-lapse films. The names of the frames have the form ITERATION-WHAT-NAME.webp. A run can be resumed without these
+files. A preview that cannot be rendered or written is omitted, and never ends a run.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ FRAME = re.compile(r"(\d{6,})-((?:view|texture|volume)-.+)\.webp")
 
 # Minimum seconds between two updates of the page, and minimum ratio of this pause to the duration of an update.
 PAUSE_S, PAUSE = 1.0, 100
-# Largest number of pixels along a side of images on the page, and of film frames.
+# Largest side in pixels of images on the page, and of time-lapse frames.
 LARGEST, FRAME_SIDE = 1024, 384
-# Size limit of all frames in a report, in bytes. It suffices for a film of each image, and keeps the page small.
+# Limit for the total size of the time-lapse frames in a report, in bytes, which keeps the report small.
 MOST_FILM_BYTES = 2_000_000
 
 PAGES = TypeAdapter(Page)
@@ -70,7 +70,7 @@ class Previews:
         self._pause = PAUSE_S
         self._resumed, self._stride = 0, 1.0
         self._kept = [0]
-        self._stale = (folder.path / STOP).exists()  # a stop request that was meant for an earlier part of the run
+        self._stale = (folder.path / STOP).exists()  # whether a stop request remains from an earlier part of the run
         self._log: list[str] = list(problem.notes)
         self._notes = Notes()
 
@@ -101,9 +101,9 @@ class Previews:
         self.folder.discard([STOP])
 
     def finished(self, after: Mapping[str, Image]) -> dict[str, tuple[Still, ...]]:
-        """Return the films for the report by subject; their last frames show the results.
+        """Add last frames that show the results, and return the time-lapse frames for the report, by subject.
 
-        Subjects are view-NAME, texture-NAME and volume-NAME. ``after`` are the resulting images by view name.
+        Subjects are view-NAME, texture-NAME and volume-NAME. ``after`` contains the final image of each view, by name.
         """
         if self.pictures.share:
             with contextlib.suppress(PathreplayError):
@@ -122,9 +122,9 @@ class Previews:
             self._write({})
 
     def _dropped_frames(self, done: int) -> set[int]:
-        """Record frames after ``done`` iterations; return the iterations whose frames must be removed.
+        """Note that there are frames for iteration ``done``; return the iterations whose frames must be removed.
 
-        The first and the latest frames stay. The others are thinned to about equal distances.
+        The first and the latest frames stay. The frames in between are thinned to about equal intervals.
         """
         kept = self._kept
         dropped = {kept.pop()} if len(kept) > 1 and kept[-1] - kept[-2] < self._stride else set()
@@ -148,7 +148,7 @@ class Previews:
         return self._frames(done, images) | self._of_views("result", "difference")
 
     def _of_views(self, *kinds: str) -> dict[str, bytes]:
-        """Return the image files of all views by name, for these kinds of images (default: all kinds)."""
+        """Encode the images of each view, and return them by file name. ``kinds`` selects images (default: all)."""
         files, shown = {}, self.pictures
         for view in shown.views:
             for kind, image in shown.now[view.name].pictures().items():
@@ -158,7 +158,7 @@ class Previews:
         return files
 
     def _begun(self) -> dict[str, bytes]:
-        """Return the first image files by name: all images of the views, and initial values and truths of grids."""
+        """Return the first preview files by name: images of views, and of initial and true textures and volumes."""
         files = self._of_views()
         for item in recovered_of(self.problem, self.run):
             for kind, image in _grids(item).items():
@@ -181,7 +181,7 @@ class Previews:
     def _continued(self) -> None:
         """Clean up files of an earlier part of the run. Called after the first step, when resuming has succeeded.
 
-        A killed run may have written frames after its last checkpoint. These do not belong to the resumed run.
+        A killed run may have written frames after its last checkpoint, which do not belong to the resumed run.
         """
         self._remove_frames(lambda iteration: iteration > self._resumed)
         self._kept = sorted({0, *(iteration for iteration, _, _ in frames(self.folder.path))})
@@ -263,7 +263,7 @@ class Previews:
 
 
 def _grids(item: Recovered) -> dict[str, Image]:
-    """Return initial value and truth (if known) of a texture or volume as images; empty for other parameters."""
+    """Return the initial and the true value (if known) of a texture or volume as images; empty for other parameters."""
     return {kind: image for kind, image in (item.textures() or item.volumes()).items() if kind in ("start", "truth")}
 
 
@@ -272,15 +272,16 @@ def _address(kind: str, item: Recovered) -> str:
 
 
 def frames(run: Path) -> Iterator[tuple[int, str, Path]]:
-    """Yield iteration, subject and file of each film frame in a run folder, in order of the iterations."""
+    """Yield iteration, subject and file of each time-lapse frame in a run folder, in order of the iterations."""
     matches = [(FRAME.fullmatch(path.name), path) for path in (run / FOLDER).glob("*.webp") if not path.is_symlink()]
     yield from sorted((int(match[1]), match[2], path) for match, path in matches if match)
 
 
 def films(run: Path, most_bytes: int | None = None) -> dict[str, tuple[Still, ...]]:
-    """Return the film frames of a run by subject.
+    """Return the time-lapse frames of a run by subject: a view, texture or volume.
 
-    With ``most_bytes``, frames are data URIs, thinned to this total size. Otherwise, they are relative addresses.
+    With ``most_bytes``, frames are embedded as data URIs, and thinned to about this total size. Otherwise, all
+    frames are returned, by addresses relative to the run folder.
     """
     stills_of: dict[str, list[tuple[int, Path]]] = {}
     for iteration, what, path in frames(run):

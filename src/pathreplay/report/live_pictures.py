@@ -58,10 +58,10 @@ class LivePictures:
             name: Likeness.of(it.result, it.target, it.exposure, it.weight) for name, it in self.now.items()
         }
         self.shown_at = done
-        """Number of completed iterations at the latest images."""
+        """Number of completed iterations when the latest images were rendered."""
 
     def observe(self, event: Event) -> None:
-        """Render images if they are due. Only for runs without a live page: `Previews` calls the other methods."""
+        """Render images if they are due. In a run with a live page, `Previews` calls the other methods instead."""
         if isinstance(event, Stepped) and self.is_due(event.entry.seconds):
             begin = time.perf_counter()
             with self._problem.computing():
@@ -70,12 +70,12 @@ class LivePictures:
 
     def is_due(self, seconds: float) -> bool:
         """Return whether images are due after an iteration that took ``seconds``."""
-        # The cost of the first images is unknown, and is estimated by the cost of an iteration, which is larger.
+        # Before the first images, their cost is estimated by the duration of an iteration, which is longer.
         allowed = self.share * (time.perf_counter() - self._began)
         return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
 
     def paid(self, seconds: float) -> None:
-        """Record the time that the latest images took."""
+        """Record how long it took to render the latest images."""
         self._cost = seconds
         self.spent += seconds
 
@@ -140,7 +140,7 @@ def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
 
 def encoded_picture(image: Image, exposure: float, side: int, kind: str) -> bytes:
     """Tone-map an image, reduce it to at most ``side`` x ``side`` pixels, and encode it as PNG or lossy WebP."""
-    # Downscale first: in double precision, a large texture would need more memory than all its other copies.
+    # Downscale before tone mapping, which would convert a large texture to double precision and need much memory.
     pixels = np.round(255 * displayed(grids.shown(image, 2 * side), exposure)).astype(np.uint8)
     picture = PIL.Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
     if max(picture.size) > side:

@@ -111,5 +111,5 @@ class NotebookPanel:
 
 
 def progress_of(shown: bool) -> Progress | NotebookPanel:
-    """Create the progress display: a panel in a notebook, otherwise a bar or lines. Without ``shown``, it is silent."""
+    """Create the progress display: a panel in a notebook, otherwise a bar or lines; silent unless ``shown`` is set."""
     return NotebookPanel() if shown and in_notebook() else Progress(shown)

@@ -53,7 +53,7 @@ class ViewPictures:
 
     @cached_property
     def likenesses(self) -> dict[str, Likeness]:
-        """Weighted image metrics of 'start', 'result' and, if any, 'baseline', at the exposure of the view."""
+        """Weighted image metrics at the exposure of the view, by kind: 'result', 'start' and, if any, 'baseline'."""
         images = {"result": self.result, "start": self.start, "baseline": self.baseline}
         return {
             kind: Likeness.of(image, self.target, self.exposure, self.weight, flip=self.is_test)
@@ -112,11 +112,11 @@ class Recovered:
     """Whether the parameter is computed from other, recovered parameters."""
 
     def known(self, *kinds: str) -> dict[str, Array]:
-        """Return the values that exist among these kinds, which are 'start', 'result', 'baseline' and 'truth'."""
+        """Return the values of the given kinds ('start', 'result', 'baseline', 'truth') that exist, by kind."""
         return {kind: value for kind in kinds if (value := getattr(self, kind)) is not None}
 
     def textures(self) -> dict[str, Image]:
-        """Return initial value, result and truth as images, reduced by `shown`.
+        """Return initial value, result and true value as images, downscaled by `shown`.
 
         Empty unless the parameter is a texture (height, width, one to four channels).
         """
@@ -147,7 +147,7 @@ class Recovered:
         return {kind: value.tolist() for kind, value in self.known("start", "result", "truth").items()}
 
     def error(self, kind: str = "result") -> float | None:
-        """Return the root mean square error of a kind: 'start', 'result' or 'baseline'.
+        """Return the root mean square error of one kind of value: 'start', 'result' or 'baseline'.
 
         None if there is no value of this kind, or if the truth is unknown.
         """
@@ -161,7 +161,7 @@ class Recovered:
         return float(np.linalg.norm(matched(self.result, self.truth) - self.truth) / np.linalg.norm(self.truth))
 
     def as_dict(self) -> Json:
-        """Return the entry in parameters.json: values of up to 16 numbers in full, others as shape, mean and range."""
+        """Return the entry in parameters.json: all numbers if there are at most 16, otherwise shape, mean and range."""
         value = self.result
         table: Json = {"shape": list(value.shape)}
         if value.size <= 16:
@@ -221,7 +221,10 @@ class RecoveredPose:
 
 @dataclass(frozen=True)
 class Contestant:
-    """A run or its baseline, compared at equal time, with the final errors of its parameters and poses by name."""
+    """One side of the comparison at equal time: the run of the job, or that of its baseline.
+
+    ``errors`` are the final errors of parameters and poses, by name.
+    """
 
     name: str
     run: Run
@@ -271,9 +274,9 @@ class Outcome:
         return f"pathreplay optimize {shlex.quote(str(job))}{changes if self.source else ''}"
 
     def names(self) -> tuple[str, str]:
-        """Return the names of the job and of its baseline, which are their integrators.
+        """Return names for the job and its baseline: the types of their integrators.
 
-        If both integrators are the same, the second name has a suffix.
+        If both types are the same, the baseline's name has a suffix.
         """
         job = self.config.integrator.type
         baseline = job if self.config.baseline is None else self.config.baseline.type

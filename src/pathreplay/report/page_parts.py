@@ -25,7 +25,7 @@ def uri(kind: str, data: bytes) -> str:
 
 
 def common_exposure(targets: Sequence[Image]) -> float:
-    """Return the display exposure for all views, with which 98 % of the (subsampled) target pixels are below white."""
+    """Return one display exposure for all views, at which 98 % of the (subsampled) target pixels are below white."""
     step = max(1, sum(target.shape[0] * target.shape[1] for target in targets) // MOST_LEVELS)
     levels = [target[..., :3].max(axis=2).reshape(1, -1, 1)[:, ::step] for target in targets]
     return exposure_for(np.concatenate(levels, axis=1)) if levels else 1.0
@@ -78,7 +78,7 @@ def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
     if not history:
         return tuple(drawn)
     errors, norms = history[-1].errors, history[-1].gradient_norms
-    for key in dict.fromkeys([*norms, *errors]):  # the errors and the gradients of a pose have different keys
+    for key in dict.fromkeys([*norms, *errors]):  # for a pose, the keys of errors and of norms differ
         if key in errors:
             drawn.append(plot("error of", key, error=(entry.errors.get(key) for entry in entries)))
         if key in norms:

@@ -42,7 +42,7 @@ class _Forgiving:
 
 
 class Progress:
-    """Context manager that shows the progress of a job, or nothing unless ``shown``.
+    """Context manager that shows the progress of a job if ``shown`` is set, and otherwise shows nothing.
 
     The notebook bar of rich is not used, because it shows nothing without ipywidgets. `NotebookPanel` replaces it.
     """

@@ -40,8 +40,8 @@ from pathreplay.report.pages.page import Comparison, Head, Mesh, Page, Parameter
 # Colours that are readable on light and dark backgrounds.
 JOB, BASELINE, GREY = "#3b82f6", "#e07b39", "#808080"
 
-# Largest number of views, and of pixels in all images, because a report may be sent by mail. A noisy pixel takes about
-# four bytes of the page. The run folder contains all views at full resolution.
+# Largest number of views, and largest total number of pixels in their images. The limits keep the report small enough
+# for mail: a noisy pixel takes about four bytes. The run folder contains all views at full resolution.
 MOST_VIEWS, MOST_PIXELS = 24, 6_000_000
 # Largest number of faces of an interactive mesh, which then takes about 3 MB of the page.
 MOST_FACES = 50_000
@@ -55,7 +55,7 @@ PANELS = 2
 def report_files(outcome: Outcome, films: Mapping[str, Film] | None = None) -> dict[str, bytes]:
     """Return the content of report.html, of the curves (SVG, PNG) and of summary.png, by file name.
 
-    ``films`` are film frames by subject; see `live_page.films`.
+    ``films`` are time-lapse frames by subject; see `live_page.films`.
     """
     contestants = outcome.comparison()
     with own_settings():
@@ -249,9 +249,10 @@ def loss_figure(history: Sequence[Entry]) -> Figure:
 
 
 def comparison_figure(contestants: Sequence[Contestant]) -> Figure:
-    """Plot the errors of two runs against time: of the images, and of the first `PANELS` parameters and poses.
+    """Plot the errors of two runs against time, in one panel per error.
 
-    Errors of poses have a logarithmic scale.
+    The panels show the error of the images, and the errors of the first `PANELS` parameters or poses. The scale is
+    logarithmic for poses.
     """
     panels = [None, *list(contestants[0].errors)[:PANELS]]
     figure = Figure(figsize=(4.4 * len(panels), 3.0), layout="constrained")
@@ -298,7 +299,7 @@ def _plain(axes: Axes, along: str) -> None:
 # Largest number of views, and of textures and volumes, in summary.png.
 SUMMARY_ROWS = 3
 SUMMARY_SIDE = 512
-"""Pixels. Larger images are reduced to this side to save memory, before they are drawn with a width of 210 pixels."""
+"""Pixels. Larger images are first downscaled to this side to save memory, and then drawn with a width of 210 pixels."""
 
 
 def summary(outcome: Outcome) -> bytes:
@@ -321,10 +322,10 @@ def summary(outcome: Outcome) -> bytes:
             pixels = displayed(shown(image, SUMMARY_SIDE), exposure)
             line[column].imshow(pixels, interpolation="nearest", vmin=0, vmax=1, cmap="gray")
             label = outcome.caption(kind)
-            short = name if len(name) <= 24 else f"…{name[-23:]}"  # must fit above an image
+            short = name if len(name) <= 24 else f"…{name[-23:]}"  # fits above an image
             line[column].set_title(label if column else f"{short}: {label}", fontsize=8)
-    # Reduce the image to 256 colours, so that noisy images are small enough for a README or a mail. Pillow dithers if a
-    # palette is given.
+    # Reduce the image to 256 colours, so that noisy images are small enough for a README or a mail. Pillow only dithers
+    # if it is given a palette.
     picture = PIL.Image.open(io.BytesIO(drawn(figure, "png"))).convert("RGB")
     buffer = io.BytesIO()
     picture.quantize(palette=picture.quantize(256)).save(buffer, "png", optimize=True)
@@ -332,7 +333,7 @@ def summary(outcome: Outcome) -> bytes:
 
 
 def versions() -> dict[str, str]:
-    """Return versions and system properties on which a run depends besides its config, by name."""
+    """Return the versions and system properties that affect a run in addition to its config, by name."""
     return {
         "pathreplay": version("pathreplay"),
         "Mitsuba": version("mitsuba"),

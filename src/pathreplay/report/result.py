@@ -50,7 +50,7 @@ class RunResult:
     test_views: tuple[str, ...]
     """Names of the views that were excluded from the optimization."""
     verdict: Verdict
-    """Which values still move, have converged, or are not determined by the images."""
+    """Assessment of the values: which still move, which have converged, and which the images do not determine."""
 
     def __repr__(self) -> str:
         """Return a short description for notebooks, because the history may have thousands of entries."""
@@ -120,7 +120,7 @@ def outcome_of(
 
 
 def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Content]:
-    """Return the content of all result files, including the report with its ``films``, by name in the run folder."""
+    """Return the content of all result files by name. The report includes the time-lapse frames ``films``."""
     table = {item.key: item.as_dict() for item in outcome.recovered}
     table |= {item.pose.key: item.as_dict() for item in outcome.poses}
     files: dict[str, Content] = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}

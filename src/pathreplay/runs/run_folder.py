@@ -251,8 +251,8 @@ def open_run_folder(path: Path, in_python: bool = False) -> tuple[Job, RunFolder
         The job and the folder.
 
     Raises:
-        PathreplayError: ``path`` is not a run folder, has no checkpoint, is damaged or in use, or the job has Python
-            objects and ``in_python`` is False, or vice versa.
+        PathreplayError: ``path`` is not a run folder, has no checkpoint, or is damaged or in use. Also raised if
+            ``in_python`` differs from whether the job has Python objects.
     """
     require_writable_name(path, "--resume")
     copy = _config_in(path)
@@ -296,7 +296,7 @@ def _config_in(path: Path) -> Path:
 
 def _job(path: Path, copy: Path) -> Job:
     try:
-        if problem := file_problem(path / "run.json", 2**20):  # far more than two paths need
+        if problem := file_problem(path / "run.json", 2**20):  # bytes: far more than a few paths need
             raise ValueError(f"it {problem}")
         origin = _Origin.model_validate_json((path / "run.json").read_bytes())
         if "\0" in origin.base + (origin.config or ""):
@@ -311,8 +311,8 @@ def _job(path: Path, copy: Path) -> Job:
 def new_output(output: str | Path | None, source: Path | None) -> Path:
     """Return the path of a new run folder: ``output``, or ``runs/NAME`` if ``output`` is None.
 
-    NAME is the name of the config file ``source``. For a file that is called ``config``, NAME is the name of its
-    folder; without ``source``, NAME is ``optimize``. Raises PathreplayError if ``output`` cannot be a folder.
+    NAME is the stem of the config file ``source``. If the stem is ``config``, NAME is the name of the file's folder.
+    Without ``source``, NAME is ``optimize``. Raises PathreplayError if ``output`` cannot be a folder.
     """
     if output is None:
         named = "optimize" if source is None else source.stem
@@ -334,13 +334,13 @@ def require_writable_name(path: Path, option: str) -> None:
             os.lstat(path)
     except UnicodeEncodeError:
         raise PathreplayError(f"Run folder {str(path)!a} is not UTF-8; give another {option}") from None
-    except (OSError, ValueError) as error:  # too long; a null character
+    except (OSError, ValueError) as error:  # the path is too long or contains a null character
         name = ascii(str(path))
         raise PathreplayError(f"Run folder {name} cannot be used ({error}); give another {option}") from None
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Remove the folders that are empty. Another process may have put files into the others."""
+    """Remove those of the folders that are empty. Another process may have put files into a folder."""
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()

@@ -31,12 +31,12 @@ class CounterSampler:
 
     @staticmethod
     def stream(key: mi.UInt32, stream: Stream) -> CounterSampler:
-        """Create a sampler for a key that starts at the first index of a stream."""
+        """Create a sampler for a key, positioned at the first index of a stream."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(int(stream)))
 
     @staticmethod
     def at_vertex(key: mi.UInt32, k: mi.UInt32) -> CounterSampler:
-        """Create a sampler at vertex k of the path with this key (six dimensions each, see `VertexSamples.draw`)."""
+        """Create a sampler at vertex k of the path with this key. A vertex uses six indices (`VertexSamples.draw`)."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(6 * k))
 
     def clone(self) -> CounterSampler:
@@ -48,8 +48,8 @@ class CounterSampler:
         return x
 
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
-        x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # the two halves of one block of the cipher
-        self.index += 2  # as many as two 1D samples: see `at_vertex`
+        x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # the two halves of a cipher block
+        self.index += 2  # a 2D sample uses two indices, so that a vertex uses six (see `at_vertex`)
         return mi.Point2f(_in_unit(x), _in_unit(y))
 
 

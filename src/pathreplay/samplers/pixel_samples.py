@@ -1,4 +1,4 @@
-"""Samples for all paths of a pixel in mutually independent sets, as `pixel_sweep` requires."""
+"""Samples for all paths of a pixel. The paths form mutually independent sets, as `pixel_sweep` requires."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import mitsuba as mi
 from pathreplay.samplers.sampler import Sampler
 
 SETS = 4
-"""Number of low-discrepancy sets per pixel, or the number of its paths if this is smaller. With fewer sets, the adjoint
-of a path depends on fewer independent paths. With more sets, the samples of a set are less evenly distributed."""
+"""Largest number of low-discrepancy sets per pixel; each set has at least one path. With fewer sets, the adjoint of a
+path depends on fewer independent paths. With more sets, the samples of a set are less evenly distributed."""
 
 
 class PixelSamples(Protocol):
@@ -33,7 +33,7 @@ class PixelSamples(Protocol):
 
 @dataclass(frozen=True)
 class IndependentSets:
-    """Samples from a sampler of Mitsuba with independent samples, so that each path is a separate set."""
+    """Samples from a Mitsuba sampler whose samples are independent, so that each path is a separate set."""
 
     sampler: mi.Sampler
 

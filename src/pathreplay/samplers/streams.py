@@ -1,9 +1,12 @@
 """Streams: named, disjoint sequences of the counter-based samplers, one per purpose.
 
-There are four kinds of streams. The value of a stream is the first index of the stream in a key
-(`CounterSampler.stream`), is combined with a seed or key by exclusive or, is added to the state of a generator, or is
-hashed into the key of a Sobol sampler. The lowest indices of a key, from 0 on, belong to the path itself, with six
-samples per vertex (see `CounterSampler.at_vertex`).
+The value of a stream is used in one of four ways, as the comments in `Stream` state:
+
+- It is combined with a seed or key, by exclusive or (`Stream.of`) or by a hash.
+- It is the first index of the stream in the sequence of a key (`CounterSampler.stream`). The lowest indices, from 0 on,
+  belong to the path itself, with six samples per vertex (see `CounterSampler.at_vertex`).
+- It is added to the state of a generator.
+- It is hashed into the key of a Sobol sampler.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import mitsuba as mi
 class Stream(IntEnum):
     """Purposes of random number streams."""
 
-    # Combined with the seed of a pass.
+    # Combined with the seed of a pass, by exclusive or.
     BOUNDARY = 0x5EED  # the boundary term; the interior term uses the seed itself
     PILOT = 0x7F4A7C15  # pilot segments, whose results determine where later segments are sampled
     CAST_SHADOWS = 0x2C1B3C6D
@@ -24,10 +27,10 @@ class Stream(IntEnum):
     SECONDARY_KEYS = 0x2545F491
     VOLUMETRIC_KEYS = 0x3C6EF372
     VOLUMETRIC_CENTRES = 0x1F83D9AB
-    # Combined with the key of a path.
+    # Combined with the key of a path, by exclusive or.
     EMITTER_SEGMENTS = 0x1B873593
     ARCS = 0x38B34AE5
-    # First index in a key.
+    # First index of the stream in the sequence of a key.
     ARC = 0x100
     BEYOND_EDGE = 0x20000  # radiance that arrives from behind an edge
     BEAM = 0x30000
@@ -41,11 +44,11 @@ class Stream(IntEnum):
     BISECT_PRIMARY = 0
     BISECT_SECONDARY = 1
     BISECT_VOLUMETRIC = 2
-    # Index of an independent sample set of a pixel (`Pass.sobol_sampler`). The interior uses set 0, and a pixel sweep
-    # the first `pixel_samples.SETS` sets.
+    # Index of an independent set of Sobol samples of a pixel (`Pass.sobol_sampler`). The interior term uses set 0. A
+    # pixel sweep uses the first `pixel_samples.SETS` sets.
     FLOW = 0x10  # paths of the film flow
     FLOW_MEAN = 0x11  # paths that estimate the mean radiance for the film flow
-    # Combined with the seed of an image.
+    # Hashed with the seed of an image.
     SECOND_IMAGE = 0x2B5AD2C7  # a second, independent image of one view
 
     def of(self, seed: mi.UInt32) -> mi.UInt32:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-_KNOBS = (  # direction, height, sharpness
+_KNOBS = (  # direction, height and sharpness of each knob
     ((1.0, 0.1, 0.2), 0.55, 7.0),
     ((-0.5, 0.8, 0.3), 0.4, 9.0),
     ((-0.4, -0.7, 0.6), 0.25, 6.0),
@@ -31,7 +31,7 @@ def ball(splits: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def knobs(directions: np.ndarray) -> np.ndarray:
-    """Return the surface points, in the given directions (n, 3), of a body of length 1 with four different knobs."""
+    """Return the surface points, one per direction (n, 3), of a body with four different knobs, scaled to length 1."""
     radius = np.full(len(directions), 0.4)
     for at, height, sharpness in _KNOBS:
         radius += height * np.exp(sharpness * (directions @ (np.array(at) / np.linalg.norm(at)) - 1))

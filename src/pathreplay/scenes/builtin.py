@@ -11,9 +11,9 @@ from pathreplay.scenes.bodies import ball, knobs, mesh
 from pathreplay.types import SceneDict
 
 COSTS: dict[str, Callable[[int], int]] = {
-    "texture": lambda n: 64 * n**2,  # three numbers per texel, with copies in double precision
-    "grid": lambda n: 256 * n**3,  # per voxel: the noise sums 12 waves, all in memory at once
-    "views": lambda n: 100_000 * n,  # a sensor with its film
+    "texture": lambda n: 64 * n**2,  # per texel: three numbers, with copies in double precision
+    "grid": lambda n: 256 * n**3,  # per voxel: the 12 waves of the noise, all in memory at once
+    "views": lambda n: 100_000 * n,  # per view: a sensor with its film
     "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # eight faces, each split into four n times
 }
 """Arguments that determine the size of a scene -> approximate memory in bytes that is needed to build the scene."""
@@ -96,14 +96,14 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
     ``front`` looks straight through the pane. ``left`` and ``right`` look at an angle of 55 degrees, where the
     thickness shifts the view and the front reflects more of the room. These views separate the effect of the index from
     the effect of the slope of the surface. The keys are ``glass.eta`` and ``front_face.bsdf.normalmap.data``. The
-    latter contains ``texture``² normals, stored as (n + 1) / 2, over the middle of the pane.
+    normal map covers the middle of the pane, and contains ``texture``² normals, stored as (n + 1) / 2.
     """
     T = mi.ScalarTransform4f
     # The pane is so wide that no path sees the rim, and its corners are inside the room.
     half, thick, distance = [2.8, 2.0, 1.0], 0.6, 2.9
     angle = np.radians(55)
     side = [float(distance * np.sin(angle)), 0.0, float(distance * np.cos(angle))]
-    # The normal map covers -0.8 to 0.8 in x and y. The rest of the pane is also visible, and continues the flat border.
+    # The normal map covers -0.8 to 0.8 in x and y. The rest of the pane is flat, like the border of the normal map.
     middle = T().translate([0.5, 0.5, 0]).scale([half[0] / 0.8, half[1] / 0.8, 1]).translate([-0.5, -0.5, 0])
     normals = _picture(_bumps(texture), wrap_mode="clamp", to_uv=middle)
     glass = {"type": "ref", "id": "glass"}
@@ -129,7 +129,7 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
 
 
 def _bumps(size: int) -> np.ndarray:
-    """Return the normal map of h = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), where w = (1 - x²)²(1 - y²)² fades it out."""
+    """Return the normal map of the height 0.03 w (sin 5x cos 4y + cos(3x + 5y)), with window w = (1 - x²)²(1 - y²)²."""
     y, x = (2 * centres - 1 for centres in _centres(size, size))
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -199,8 +199,8 @@ def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
 def silhouettes(resolution: int = 32, views: int = 2) -> SceneDict:
     """Describe a black body of length 1 with four knobs in front of a white sky: only its silhouette is visible.
 
-    The key of the vertices is ``body.vertex_positions``. The cameras are placed around the body at equal angles. Two
-    cameras are 90 degrees apart.
+    The key of the vertices is ``body.vertex_positions``. With ``views`` = 2, the cameras are 90 degrees apart. More
+    cameras are placed around the body at equal angles.
     """
     black = {"type": "diffuse", "reflectance": 0.0}
     vertices, faces = ball(4)
@@ -249,7 +249,7 @@ def shadows(resolution: int = 32, views: int = 4, ball_splits: int = 0) -> Scene
 
 
 def silhouette_in_mirror(resolution: int = 32) -> SceneDict:
-    """Describe the body of `silhouettes`, seen by one camera directly and, from its other side, in a mirror.
+    """Describe the body of `silhouettes` beside a mirror: one camera sees the body, and its other side in the mirror.
 
     The width of the image is twice its height. The rim of the mirror is invisible, because the mirror reflects the same
     white sky that surrounds it.
@@ -272,7 +272,7 @@ def _panel(place: mi.ScalarTransform4f, *colour: float) -> SceneDict:
 def flat_colours(resolution: int = 32) -> SceneDict:
     """Describe emissive panels of one colour each, at different distances before a black background.
 
-    An image shows nothing but edges. The camera, ``camera.to_world``, looks at the panels from a distance of 3.
+    An image shows nothing but edges. The camera (key ``camera.to_world``) looks at the panels from a distance of 3.
     """
 
     def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> mi.ScalarTransform4f:
@@ -315,8 +315,8 @@ def _cumulus(size: int) -> np.ndarray:
     """Return the extinction of a cloud at the voxel centres of [-1, 1]³, as an array of shape (z, y, x, 1).
 
     The extinction is max(0, 8 b(y) Σ_i exp(-|x - c_i|² / r_i²) (0.75 + n(x)) - 1.5). The sum is over six Gaussian
-    blobs. The factor b cuts off their lower part, so that the base is flat. The noise n is a sum of 12 plane waves with
-    wavelengths from 0.5 to 1.2.
+    blobs. The factor b cuts off the lower part of the blobs, so that the base is flat. The noise n is a sum of 12 plane
+    waves with wavelengths from 0.5 to 1.2.
     """
     z, y, x = (2 * centres - 1 for centres in _centres(size, size, size))
     shape = np.zeros_like(x)
@@ -336,10 +336,10 @@ def _cumulus(size: int) -> np.ndarray:
 
 
 def _sky(rows: int) -> np.ndarray:
-    """Return a sky, blue above and dim below, with a sun at 50 degrees, blurred over 8 degrees so that paths hit it."""
+    """Return a sky, blue above and dim below. The sun, 50 degrees high, is blurred over 8 degrees, so paths hit it."""
     v, u = _centres(rows, 2 * rows)
     θ, φ = np.pi * v, 2 * np.pi * u
-    d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)  # Mitsuba's envmap
+    d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)  # as in Mitsuba's envmap
     up = 0.5 + 0.5 * d[..., 1:2]
     sky = up * np.array([0.2, 0.3, 0.5]) + (1 - up) * np.array([0.14, 0.12, 0.11])
     # The sun is on the side of the cameras that look up from below, so that no image contains the sun.

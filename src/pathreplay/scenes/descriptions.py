@@ -38,10 +38,10 @@ def load_integrator(description: Mapping[str, object]) -> mi.Integrator:
 
 @contextmanager
 def errors_as(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Iterator[None]:
-    """Convert exceptions of these kinds into a PathreplayError whose message begins with ``what``.
+    """Convert exceptions of the given ``kinds`` into a PathreplayError whose message begins with ``what``.
 
-    The message quotes the first exception of the chain, because the exceptions that Dr.Jit's calls and loops raise
-    afterwards are uninformative. If Dr.Jit converted a Ctrl-C into such an exception, KeyboardInterrupt is raised.
+    The message quotes the first exception of the chain. Later exceptions, raised by Dr.Jit's calls and loops, are
+    uninformative. If the first exception is a KeyboardInterrupt (Ctrl-C), it is raised again instead.
     """
     try:
         yield

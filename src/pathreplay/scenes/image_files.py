@@ -40,7 +40,7 @@ class PixmapHead:
     highest: int
     """Value of white."""
     length: int
-    """Bytes of the header."""
+    """Length of the header in bytes."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,11 @@ class RadianceHead:
     xyz: bool
     """Whether the values are CIE XYZ instead of RGB."""
     length: int
-    """Bytes of the header."""
+    """Length of the header in bytes."""
 
 
 def pixmap_head(data: bytes) -> PixmapHead:
-    """Parse the header of a PGM or PPM file, which may contain comments. Raises ValueError if there is none."""
+    """Parse the header of a PGM or PPM file, including comments. Raises ValueError for an invalid header."""
     if not (match := _PIXMAP.match(data)) or not 0 < int(match[4]) < 2**16:
         raise ValueError("it has no PGM or PPM header")
     width, height, highest = (int(match[n]) for n in (2, 3, 4))
@@ -107,9 +107,9 @@ def size_of_picture(path: Path) -> tuple[int, int] | None:
 
 
 def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
-    """Raise PathreplayError for an image without pixels, with more than ``pixels``, or too large for the memory.
+    """Raise PathreplayError if an image has no pixels, has more than ``pixels`` pixels, or does not fit into memory.
 
-    Also raise PathreplayError for a TGA whose runs Mitsuba would decode beyond the last pixel of the image.
+    The same error is raised for a damaged TGA, see `require_sound_tga`.
     """
     size = size_of_picture(path)
     if size is None:
@@ -150,7 +150,7 @@ def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
 
 
 def _jpeg_size(file: BinaryIO) -> tuple[int, int]:
-    """Parse the size in the frame header, which follows other segments."""
+    """Skip segments up to the frame header of a JPEG, and parse the size there."""
     file.seek(2)
     for _ in range(_MOST_PARTS):
         if file.read(1) != b"\xff":

@@ -27,7 +27,7 @@ _COARSE = "BitmapTextureImpl[uint8]"
 
 
 def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: object) -> mi.Scene:
-    """Load a scene whose parameter keys contain the names in the file.
+    """Load a scene such that parameter keys contain the ids of the objects in the file.
 
     ``spec`` is the path of a Mitsuba XML file, relative to ``base`` (default: the current folder), or the name of a
     built-in scene (see ``BUILTINS``). ``parameters`` are the values of ``$name`` in the file, or the arguments of the

@@ -25,14 +25,14 @@ class _Element:
     name: str
     count: int
     properties: list[tuple[str, ...]]
-    """Each property as in the header: a type and a name, or 'list', two types and a name."""
+    """Words of each property in the header: a type and a name, or 'list', two types and a name."""
 
     @property
     def kinds(self) -> list[str]:
         return [kinds[0] for kinds in self.properties]
 
     def layout(self, form: str) -> np.dtype[np.void]:
-        """Return the data type of one entry; lists have three items, and numbers in text files double precision."""
+        """Return the NumPy type of an entry. Lists must have three items. Numbers from text files become float64."""
         order = "<" if form == "binary_little_endian" else ">"
         fields: list[tuple[str, str] | tuple[str, str, int]] = []
         for i, (*kinds, _) in enumerate(self.properties):
@@ -81,7 +81,7 @@ def _ply_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
 
 
 def _triangles(file: BinaryIO, elements: list[_Element], form: str) -> np.ndarray | None:
-    """Read the vertex indices (n, 3), or return None for missing data or other polygons, which Mitsuba rejects."""
+    """Read the vertex indices (n, 3). Return None for missing data or other polygons: Mitsuba rejects both."""
     vertex, face = (element.layout(form) for element in elements[:2])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy warns if text follows the numbers

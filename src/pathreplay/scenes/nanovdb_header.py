@@ -45,8 +45,8 @@ class _Place(NamedTuple):
 def require_whole_nanovdb(path: Path) -> bool:
     """Check headers, sizes and tree positions of a NanoVDB file; return whether its first grid is compressed.
 
-    Zip-compressed grids are decompressed, which verifies their checksum. Not checked are values, and links inside an
-    uncompressed tree.
+    Zip-compressed grids are decompressed, which verifies their checksum. Values are not checked. Links between the
+    nodes of an uncompressed tree are not checked either.
 
     Raises PathreplayError if the file is not NanoVDB, has an unknown version, or is damaged.
     """

@@ -96,7 +96,7 @@ def owner_class(params: mi.SceneParameters, key: str) -> str:
 def require_differentiable(params: mi.SceneParameters, key: str, integrator: mi.Integrator | None = None) -> None:
     """Raise PathreplayError unless ``integrator`` (None: any integrator of Mitsuba) can differentiate ``key``.
 
-    Not differentiable are missing keys, plain numbers, integers, empty arrays, and most parameters with the flag
+    The error is raised for missing keys, plain numbers, integers, empty arrays, and most parameters with the flag
     ``mi.ParamFlags.NonDifferentiable`` (see `carries_derivative`). The message names a remedy if there is one.
     """
     if key not in params:
@@ -140,7 +140,7 @@ def resolve_differentiable(
 ) -> list[str]:
     """Return the differentiable keys among those that `resolve_keys` returns.
 
-    Raises PathreplayError if a pattern matches nothing, or nothing that is differentiable.
+    Raises PathreplayError if a pattern matches no key, or no differentiable key.
     """
     selected: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
@@ -166,8 +166,8 @@ def carries_derivative(params: mi.SceneParameters, key: str, integrator: mi.Inte
     return getattr(integrator, "moves_rays", False) and needs_ray_adjoint(params, key)
 
 
-# Parameters that Mitsuba marks as NonDifferentiable, because its integrators drop their derivatives.
-# tests/scenes/test_cameras_and_lights.py compares the derivative of each parameter with finite differences.
+# Parameters that `pathreplay` differentiates. Mitsuba marks them as NonDifferentiable, because its own integrators drop
+# their derivatives. tests/scenes/test_cameras_and_lights.py compares each derivative with finite differences.
 _PRINCIPAL_POINT = {"principal_point_offset_x", "principal_point_offset_y"}
 _CAMERA = {"to_world", "x_fov", "aperture_radius", "focus_distance"} | _PRINCIPAL_POINT
 _LIGHT = {"to_world", "position"}
@@ -191,7 +191,7 @@ def is_transform(value: object) -> TypeIs[mi.Transform4f]:
 
 
 def _array(value: T) -> T | mi.Matrix4f:
-    """Return the Dr.Jit array of a value, which is the matrix of a transform."""
+    """Return the Dr.Jit array of a value; for a transform, return its matrix."""
     return value.matrix if is_transform(value) else value
 
 

@@ -116,7 +116,7 @@ class SceneFunction:
 
     def _put(self, values: Sequence[mi.TensorXf], grad: bool) -> list[mi.TensorXf]:
         """Set the parameters of the scene; return the values, attached if ``grad``."""
-        one = dr.opaque(mi.Float, 1)  # the product is a copy: optimisers may modify the original memory in place
+        one = dr.opaque(mi.Float, 1)  # copies the values by multiplication: optimisers may modify the original memory
         seen = [dr.detach(value) * one for value in values]
         dr.eval(seen)
         if grad:

@@ -25,7 +25,7 @@ _COLOURS = ("SRGBReflectanceSpectrum", "D65Spectrum")
 
 
 def coefficient_channels(params: mi.SceneParameters, key: str) -> int:
-    """Return the number of channels of coefficients in a parameter: 3, 4 with a factor, or 0 without coefficients."""
+    """Return the number of channels if a parameter stores coefficients: 3, or 4 with a factor. Otherwise return 0."""
     if not mi.is_spectral:
         return 0
     owner, name = params.properties[key][2], key.rsplit(".", 1)[-1]

@@ -169,7 +169,7 @@ def _entries(value: SceneValue, channels: int) -> Any:
 
 
 def _like(value: SceneValue, entries: mi.Vector3f | mi.Vector4f) -> SceneValue:
-    """Combine channels into a colour or tensor like ``value``, with as many channels as given."""
+    """Combine channels into a colour or tensor like ``value``. The number of channels may differ from ``value``."""
     if not dr.is_tensor_v(value):
         return type(value)(entries)
     return mi.TensorXf(dr.ravel(entries), (*value.shape[:-1], len(entries)))

@@ -66,7 +66,7 @@ def load_dict_with(
 
 
 def exchange(props: mi.Properties, plugins: Mapping[str, str], floats: Collection[str]) -> bool:
-    """Replace the plugin of an object, or set the option for ``floats``; return whether the plugin was replaced."""
+    """Replace the plugin of an object, or make a bitmap store floats; return whether the plugin was replaced."""
     if (new := plugins.get(props.plugin_name())) is not None:
         props.set_plugin_name(new)
         return True
@@ -77,7 +77,7 @@ def exchange(props: mi.Properties, plugins: Mapping[str, str], floats: Collectio
 
 @contextmanager
 def _parsing() -> Iterator[mi.parser.ParserConfig]:
-    """Provide options for the parser; within the block, a separate file resolver is active."""
+    """Provide options for the parser, and use a separate file resolver within the block."""
     config = mi.parser.ParserConfig(mi.variant())
     # Merging equal objects would change parameter keys.
     config.merge_equivalent = config.merge_meshes = False

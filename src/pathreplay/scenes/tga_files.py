@@ -1,4 +1,4 @@
-"""Check TGA files before Mitsuba decodes them, because Mitsuba does not test whether runs exceed the image.
+"""Check TGA files, because Mitsuba decodes run-length packets without testing whether they exceed the image.
 
 The format has no magic number at its beginning. Mitsuba recognises a TGA by the footer of version 2.
 """
@@ -17,7 +17,7 @@ _END = b"TRUEVISION-XFILE.\0"
 _MOST = 2**15 - 1
 """Largest width and height in pixels. Mitsuba reads width and height as signed numbers."""
 _RUNS = {10: (24, 32), 11: (8,)}
-"""Run-length encoded image types, colour and grey, and their possible bits per pixel."""
+"""Run-length encoded image types (10: colour, 11: grey) -> possible bits per pixel."""
 
 
 def is_tga(file: BinaryIO) -> bool:
@@ -33,7 +33,7 @@ def tga_size(data: bytes) -> tuple[int, int]:
 
 
 def require_sound_tga(path: Path) -> None:
-    """Raise PathreplayError for a TGA that is too wide or too high, or whose runs do not add up to the image.
+    """Raise PathreplayError if a TGA is too wide or too high, or its packets contain too few or too many pixels.
 
     Other files are ignored. Mitsuba itself detects other damage.
     """
@@ -42,7 +42,7 @@ def require_sound_tga(path: Path) -> None:
             return
         file.seek(0)
         skipped, colours, kind, width, height, bits = _HEAD.unpack(file.read(_HEAD.size))
-        if colours:  # the file has a palette, which Mitsuba rejects, or is of another format
+        if colours:  # a TGA with a palette, which Mitsuba rejects, or another format
             return
         if max(width, height) > _MOST:
             raise PathreplayError(
@@ -59,9 +59,9 @@ def require_sound_tga(path: Path) -> None:
 
 
 def _filled(data: bytes, pixels: int, pixel: int) -> int:
-    """Count the pixels in the packets of a file, up to the packet with which there are ``pixels`` or more.
+    """Count the pixels in the packets of a file, until the count reaches ``pixels``.
 
-    The lower seven bits of the first byte of a packet are the number of its pixels minus one. The pixels follow, of
+    The lower seven bits of the first byte of a packet are the number of pixels minus one. The pixels follow, of
     ``pixel`` bytes each. If the highest bit of the first byte is set, a single pixel follows, which is repeated.
     Truncated packets do not count.
     """

@@ -119,8 +119,8 @@ def grid_volume(path: str | Path, grid: str | None = None, **options: object) ->
     """Describe a volume file as a `gridvolume` for a scene dictionary, positioned in the world space of the file.
 
     ``options`` are properties of the plugin, such as ``filter_type``, ``wrap_mode`` and ``raw``. The option
-    ``to_world`` replaces the transform in the file. The values have the key ``….data`` and are differentiable, and the
-    position is not. A Mitsuba variant must be active.
+    ``to_world`` replaces the transform in the file. The values are differentiable, with the key ``….data``. The
+    position is not differentiable. A Mitsuba variant must be active.
     """
     volume = load_volume(path, grid)
     return {
@@ -132,7 +132,7 @@ def grid_volume(path: str | Path, grid: str | None = None, **options: object) ->
 
 
 def require_whole_vol(path: Path) -> None:
-    """Raise PathreplayError for a `.vol` file of impossible length or size, or with unusable channels or values.
+    """Raise PathreplayError if a `.vol` file is empty or truncated, or if its channels or values are not supported.
 
     Mitsuba reports other damage.
     """

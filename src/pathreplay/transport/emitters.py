@@ -31,7 +31,7 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
 def vertex_glow(
     trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool
 ) -> mi.Spectrum:
-    """Return the `emission` at a vertex; zero if no surface emits and the background is added separately."""
+    """Return the `emission` at a vertex, or zero if there is no area light and the caller adds the background."""
     if trace.background_apart and not trace.traits.area_lights:
         return mi.Spectrum(0)
     return emission(trace.scene, at, si, attached, active)
@@ -93,8 +93,8 @@ def _at_fixed_point(
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
     """Attach a sample on a textured emissive mesh to fixed barycentric coordinates; return the sample with Le/p.
 
-    ``still`` is the detached sample. Mitsuba samples such a mesh by intersecting it in texture space, and its own
-    attached sample would slide over the mesh.
+    ``still`` is the detached sample. Mitsuba samples such a mesh by intersecting it in texture space. Mitsuba's own
+    attached sample would not keep its barycentric coordinates when the mesh moves.
     """
     ray = dr.detach(origin.spawn_ray_to(still.p))
     ray.maxt = dr.largest(mi.Float)

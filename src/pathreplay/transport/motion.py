@@ -81,7 +81,7 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        # Rough lobes do not count for edges. With attach = 'delta', they are attached only in scenes without outlines.
+        # For edges, rough lobes are skipped: with attach = 'delta', they are attached only in scenes without outlines.
         for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
             moving.append(sample.wo)

@@ -20,12 +20,12 @@ MAX_SURVIVAL = 0.95
 
 @dataclass
 class PathState:
-    """Loop state of a path: its arrival at the current vertex, and the throughput accumulated before."""
+    """Loop state of a path: the arrival at the current vertex, and the throughput up to this vertex."""
 
     at: Arrival
     β: mi.Spectrum  # throughput
-    # Throughput in which `sustain` replaces the first zero weight of each channel. Paths end according to β_alive and
-    # not to β, so that paths with derivatives continue. None if zero weights end paths.
+    # β, but with the first zero weight of each channel replaced (see `sustain`). Termination depends on β_alive and not
+    # on β, so that paths with derivatives continue. None if zero weights end paths.
     β_alive: mi.Spectrum | None
     η: mi.Float  # relative index of refraction since the camera
     depth: mi.UInt32  # number of vertices before this one
@@ -53,7 +53,7 @@ class PathState:
         return replace(self, active=self.active & ~left), left
 
     def passed(self, trace: TraceConfig, step: SampledStep) -> mi.UInt32:
-        """Return the number of vertices before the next one; with media a null boundary is not counted."""
+        """Return the number of vertices before the next vertex; with media, null boundaries do not count."""
         return self.depth + (1 if trace.media is None else dr.select(step.null, mi.UInt32(0), 1))
 
     def advance(
@@ -91,12 +91,12 @@ def survival(
 
 
 def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spectrum:
-    """Return the throughput that keeps a differentiated path alive: the first zero weight per channel is replaced.
+    """Return the throughput after this step, with the first zero weight of each channel replaced by a nonzero number.
 
     A weight of zero can have a nonzero derivative, which multiplies the radiance from the rest of the path. The path
-    therefore continues as if the weight were the largest weight among the channels, or one if all are zero. A second
-    weight of zero makes all derivatives zero and ends the path. A channel in which null collisions have weight zero
-    ends as well, because this weight comes from the sampling and not from the scene.
+    must therefore continue. The replacement is the largest weight among the channels, or one if all weights are zero. A
+    second zero weight is not replaced: all derivatives of the channel are then zero. A zero weight of null collisions
+    is not replaced either, because this weight comes from the sampling and not from the scene.
     """
     w = dr.detach(step.w)
     w_max = dr.max(w)

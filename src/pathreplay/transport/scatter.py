@@ -1,10 +1,10 @@
 """Scatter: sample the continuation of a path at a surface or in a medium, and differentiate its weight and direction.
 
 The sampling pass chooses a lobe, and later passes keep this choice. Smooth lobes use detached sampling: the weight f/p
-is differentiated with constant p. Their direction is constant, or follows the next hit point, which is fixed on its
-surface (see `velocity`). Delta lobes use attached sampling: the derivative passes through the sampled direction. With
-``attach='all'``, the smooth lobes of attachable BSDFs are sampled attached as well. With ``attach='delta'``, only
-narrow lobes are, and only in scenes without outlines.
+is differentiated with constant p. The direction of a smooth lobe is constant, or points to the next hit point, which
+moves with its surface (see `velocity`). Delta lobes use attached sampling: the derivative passes through the sampled
+direction. With ``attach='all'``, the smooth lobes of attachable BSDFs are also sampled attached. With
+``attach='delta'``, the only smooth lobes sampled attached are narrow lobes in scenes without outlines.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from pathreplay.transport.vertex import (
     reciprocal,
 )
 
-# Tolerance for comparing a lobe sampled alone with the original sample. It limits the relative difference of the
-# weights and the squared distance of the directions. Rounding errors in float32 are far smaller; the differences for
-# BSDFs that do not support restricted sampling (`mask`) are far larger.
+# Largest relative difference of the weights, and largest squared distance of the directions, between a lobe sampled
+# alone and the original sample. Rounding errors in float32 are far smaller. BSDFs that do not support restricted
+# sampling (`mask`) have far larger differences.
 SAME_LOBE = 1e-3
 
 # A lobe counts as narrow if its density at the centre is larger than that of a diffuse lobe. The noise of a detached
-# lobe is proportional to the slope of the log density, the noise of an attached lobe to the slope of the radiance.
-# docs/gradients.md lists the variances for different roughnesses.
+# lobe is proportional to the slope of the log density. The noise of an attached lobe is proportional to the slope of
+# the radiance. docs/gradients.md lists the variances for different roughnesses.
 NARROW = 1 / dr.pi
 
 
@@ -113,7 +113,7 @@ def repeat(
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
     """Evaluate weight w, world direction and density of the recorded continuation again, differentiably.
 
-    Not differentiated: the choice among lobes and, unless ``attached``, direction and density.
+    Direction and density are differentiated only if ``attached``. The choice among lobes is never differentiated.
     """
     w, d, pdf = _at_surface(trace, v, again, ctx, attached, again.go_on & v.surface)
     if v.inside is None:
@@ -150,8 +150,8 @@ def _at_surface(
     else:
         f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
     w = f * J * dr.detach(reciprocal(kept.pdf))
-    # A failed sample (`roughdielectric` may reflect to the far side) has weight zero, whatever f is. A black BSDF
-    # has weight zero because f is zero, and keeps its derivative.
+    # A failed sample has weight zero even if f is not zero (`roughdielectric` may reflect to the far side). The weight
+    # of a black BSDF is also zero, but here f is zero, and the derivative of the weight is kept.
     w = dr.select(kept.black & dr.any(dr.detach(f) != 0), 0, w)
 
     if attached and trace.resamples:
@@ -165,9 +165,10 @@ def _at_surface(
 def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
     """Return the lanes with narrow lobes, in which smooth continuations have a fixed direction.
 
-    A direction that follows its hit point would turn the motion of the hit surface into noise, through the slope of a
-    narrow lobe. A fixed direction slides over edges, and is therefore used only if boundary terms are estimated. The
-    choice depends on vertex and incident ray only, so that all directions sampled at a vertex move in the same way.
+    If the direction followed a moving hit point, the value of the lobe would change with the direction. In a narrow
+    lobe, this derivative is large and noisy. Edges move across a fixed direction, which is therefore used only if
+    boundary terms are estimated. The choice depends on vertex and incident ray only, so that all directions sampled at
+    a vertex move in the same way.
     """
     if not (trace.may_slide and trace.traits.glossy):
         return mi.Bool(False)
@@ -176,10 +177,11 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
 
 
 def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Return the lanes whose hit surface passes part of the light unscattered; there, the direction is fixed.
+    """Return the lanes whose hit surface passes part of the light unscattered. These lanes have a fixed direction.
 
-    A direction that followed a moving transparent sheet would slide over the surfaces behind the sheet and over their
-    edges. All lanes are False unless boundary terms are estimated, which include the outline of the sheet.
+    A direction that followed the motion of such a surface would move across the surfaces behind, and across their
+    edges. With a fixed direction, the outline of the transparent surface needs a boundary term. All lanes are therefore
+    False unless boundary terms are estimated.
     """
     if not (trace.may_slide and trace.traits.veils):
         return mi.Bool(False)
@@ -187,7 +189,7 @@ def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi
 
 
 def _followed(trace: TraceConfig, v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
-    """Return the lanes whose smooth lobe is sampled attached; depends on the lobe, not on the sampled direction."""
+    """Return the lanes whose smooth lobe is sampled attached; independent of the direction within the lobe."""
     if not trace.follows:
         return mi.Bool(False)
     index = dr.reinterpret_array(mi.UInt32, v.bsdf)
@@ -238,8 +240,8 @@ def _at_particle(
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
     """Evaluate weight, direction and density of the continuation from a collision in a medium again.
 
-    The direction follows the next hit point only if the surface hit there scatters or emits, because such a surface may
-    have texture seams and edges. Otherwise the direction is constant, which is less noisy.
+    If the next surface scatters or emits, the direction points to the hit point, which moves with the surface: such a
+    surface may have texture seams and edges. On other surfaces the direction is constant, because this is less noisy.
     """
     kept, hit_next = again.kept, again.hit_next
     d, J = kept.d, mi.Float(1)

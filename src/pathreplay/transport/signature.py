@@ -1,4 +1,4 @@
-"""Hashes of the surfaces that rays hit, which differ for two rays with an edge between them, and edge normals."""
+"""Edge normals, and hashes of the surfaces that rays hit. The hashes of two rays with an edge between them differ."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _group(tables: Tables, shape: mi.UInt32, triangle: mi.UInt32, met: mi.Bool) 
 
 
 def shape_met(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.ShapePtr:
-    """Return the shape that a ray hit; on an instance, the shape inside, to which ``hit`` does not refer."""
+    """Return the shape that a ray hit. For a shape inside an instance, ``hit.shape`` is not this shape."""
     if not trace.traits.copies:
         return hit.shape
     return hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & hit.is_valid()).shape
@@ -54,8 +54,8 @@ def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
 def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
     """Return whether the shading normal of a mesh faces away from a ray along ``d``, so that shading is black.
 
-    The result is False on other shapes. Their normals face away only through rounding at the silhouette, where the
-    outline is an edge in any case.
+    On other shapes, the result is False. Normals of other shapes face away only through rounding at the silhouette,
+    which is detected as an edge in any case.
     """
     return si.shape.is_mesh() & (dr.dot(si.sh_frame.n, d) > 0)
 
@@ -97,10 +97,10 @@ def outline_gap(
     ray: mi.Ray3f,
     active: mi.Bool,
 ) -> mi.Float:
-    """Evaluate B = n·(o + t d - z): the signed distance, along n, of a line from a point z of an outline.
+    """Evaluate B = n·(o + t d - z): the signed distance, along n, from a point z of an outline to the line (o, d).
 
-    ``ray`` hit z at distance t. z has fixed surface coordinates on its shape. Differentiable in o, d and the shape;
-    zero where not ``active``.
+    ``ray`` hit z at distance t. The point z has fixed surface coordinates on its shape. Differentiable in o, d and the
+    shape; zero where not ``active``.
     """
     z = surface_point(hit, dr.detach(ray), active).p
     return dr.select(active, dr.dot(n, o + dr.select(active, hit.t, 0) * d - z), 0)
@@ -114,7 +114,7 @@ def _nearest_side(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
         flags = mi.RayFlags.FollowShape | mi.RayFlags.Minimal
         corners.append(corner.compute_surface_interaction(ray, flags, active).p)
     a, b, c = corners
-    sides = (c - b, c - a, b - a)  # opposite a, b, c
+    sides = (c - b, c - a, b - a)  # the sides opposite to a, b and c
     weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
     # Distances of the point from the sides, divided by twice the area of the triangle.
     heights = [dr.abs(w) * dr.rcp(dr.norm(side)) for w, side in zip(weights, sides, strict=True)]

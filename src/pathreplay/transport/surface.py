@@ -21,10 +21,10 @@ def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi
     """Compute the surface interaction of a hit, differentiable in the ray and the shape.
 
     The derivative of the distance to a sphere or cylinder is proportional to 1 / c, with c the cosine between ray and
-    normal. The square of this derivative has no finite mean over rays, and where rounding puts a ray onto the
-    silhouette, the derivative reaches many millions. Derivatives are therefore set to zero for c < `GRAZES` and doubled
-    for `GRAZES` <= c < 2 `GRAZES`. Uniformly distributed rays have cosines with a density proportional to c, which
-    cancels 1 / c, so that both bands contribute equally to the mean. The remaining bias is of second order in `GRAZES`.
+    normal. The mean square of this derivative over rays is infinite. Where rounding puts a ray onto the silhouette, the
+    derivative reaches many millions. Derivatives are therefore set to zero for c < `GRAZES` and doubled for `GRAZES` <=
+    c < 2 `GRAZES`. This keeps the mean, because both bands contribute equally: for uniformly distributed rays, the
+    density of c is proportional to c and cancels 1 / c. The remaining bias is of second order in `GRAZES`.
     """
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
     kind = si.shape.shape_type()
@@ -73,8 +73,8 @@ class SurfacePoint:
 def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> SurfacePoint:
     """Return the point that ``ray`` hit, with fixed surface coordinates.
 
-    On meshes, A is the cross product of two sides of the triangle. The derivatives of position with respect to texture
-    coordinates are not used: they vanish where texture coordinates are degenerate, and change where these move.
+    On meshes, the area vector A is the cross product of two sides of the triangle. The derivatives of the position with
+    respect to texture coordinates would be zero for degenerate texture coordinates, and would depend on their motion.
     """
     flags = mi.RayFlags.FollowShape
     on_mesh = active & hit.shape.is_mesh()

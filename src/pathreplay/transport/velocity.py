@@ -1,23 +1,23 @@
 """Velocity field of smooth continuations under motion: follow the next hit point or keep the direction.
 
 Let x be a vertex, y the hit point of its continuation along d, and r = |y - x|. An integral over directions does not
-depend on its parametrisation: d may move with any velocity field V(d) if the weight includes its divergence, through
-(log J)' = div V. Two simple fields are
+depend on its parametrisation. The direction d may therefore move with any velocity field V(d), if the weight contains a
+factor J with (log J)' = div V. Two simple fields are
 
-    V_H    follows y, which is fixed on its surface: J_H = |A·d| / r², with A the area element at y
-    0      keeps d
+    V_H    d points to y, which moves with its surface: J_H = |A·d| / r², with A the area element at y
+    0      d is constant
 
-With V_H, the edges of emitters and the seams between materials stay at fixed positions of the integrand. With other
-fields, their motion is a boundary term that the interior term misses. However, where x slides past the surface of y at
-a distance h, (log J_H)' grows like 1/h, so that the variance is infinite wherever two surfaces touch. The field used
-here is therefore the blend V = φ V_H, with φ = 1 - exp(-m) and m = h r / h0²:
+With V_H, the edges of emitters and the seams between materials have fixed positions in the integrand. With other
+fields, their motion is a boundary term, which the interior term does not contain. However, let h be the distance from x
+to the plane of y. If x moves parallel to this plane, (log J_H)' grows like 1/h, and the variance is infinite wherever
+two surfaces touch. The field used here is therefore the blend V = φ V_H, with φ = 1 - exp(-m) and m = h r / h0²:
 
     (log J)' = φ (log J_H)' + ∇φ·V_H,        ∇φ·V_H = -m exp(-m) (n·d_H') / (n·d)
 
-The second equation uses that r depends on d and h does not: all d that hit the plane of y have the same h. The factor r
-in m keeps V close to V_H for hit points far away on a near plane. Few directions reach these points, at grazing angles.
-Following these points costs little variance, and edges lie there. For a sphere, h is the distance from x to the sphere,
-which also does not depend on d and does not vanish at the silhouette. On other curved shapes, V = V_H.
+In the second equation, only r depends on d: all directions that hit the plane have the same h. The factor r in m keeps
+V close to V_H at distant hit points on a near plane. Such points may lie on edges. The cost in variance is small,
+because few directions, at grazing angles, reach them. For a sphere, h is the distance from x to the sphere, which also
+does not depend on d and does not vanish at the silhouette. On other curved shapes, V = V_H.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ import mitsuba as mi
 
 from pathreplay.transport.surface import SurfacePoint, surface_point
 
-# h0 over the size of the shape that was hit. A larger value gives less noise and loses more of the motion of nearby
-# edges; docs/gradients.md has measurements for 0.003 to 0.03.
+# h0 relative to the size of the shape that was hit. A larger value gives less noise, but more of the derivative due to
+# nearby moving edges is missing. docs/gradients.md has measurements for 0.003 to 0.03.
 BLEND = 0.01
 # Value of m above which V equals V_H to within 0.1 %.
 CLOSE = 7.0
@@ -58,7 +58,7 @@ def moved_direction(
     ok = valid & (facing > 0)
     dist2 = dr.select(ok, dr.squared_norm(towards), 1)
     d_H = towards * dr.rsqrt(dist2)
-    # The derivative of log J stays finite at the tiny distances in corners, where powers of distances would overflow.
+    # log J is differentiated instead of J, because powers of the tiny distances in corners would overflow.
     log_J_H = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
 
     h0 = dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, hit.shape), ok)

@@ -45,11 +45,11 @@ class TraceConfig:
     """Maps (MediumInteraction3f, extinction, majorant, Bool) to a Spectrum, an estimate of the radiance that arrives at
     a point of a medium along the ray. None means zero. The quality of the estimate affects noise, but not the mean."""
     branching: mi.Float | None = None
-    """Relative weight c of null collisions (see `branch_weight`), or None if no null collision is kept. One null
-    collision per path is kept for derivatives where real collisions cannot occur."""
+    """Relative weight c of null collisions (see `branch_weight`), or None without null branching. Null branching keeps
+    one null collision per path, for derivatives where real collisions cannot occur."""
     may_slide: bool = False
-    """Whether boundary terms are estimated. Some smooth continuations then have a fixed direction, which may slide over
-    edges (see `keeps_direction` and `is_seen_through` in `scatter`)."""
+    """Whether boundary terms are estimated. Some smooth continuations then have a fixed direction, although edges may
+    move across this direction (see `keeps_direction` and `is_seen_through` in `scatter`)."""
 
     # Choices of the caller.
     skips_null: bool = False
@@ -67,7 +67,7 @@ class TraceConfig:
 
     @property
     def follows(self) -> bool:
-        """Whether smooth lobes may be sampled attached: all of them, or narrow lobes in scenes without outlines."""
+        """Whether smooth lobes may be sampled attached; with ``delta``, only narrow ones in scenes without outlines."""
         narrow = self.attach == "delta" and not self.traits.outlines
         return bool(self.traits.attachables) and (narrow or self.attach == "all")
 
@@ -170,13 +170,13 @@ class Flight:
 
 @dataclass
 class NullCollision:
-    """The null collision of a flight that weighted reservoir sampling selected, for `null_branching`.
+    """The null collision that weighted reservoir sampling selected on a flight, for `null_branching`.
 
     Each null collision has a resampling weight m and is selected with probability m / ``mass``.
     """
 
     t: mi.Float  # distance of the collision along the ray
-    ω: mi.Spectrum  # W of the null collisions before it, times c branch_weight(p, c) / σ̄, over m
+    ω: mi.Spectrum  # W c branch_weight(p, c) / (σ̄ m), with W the weight of all earlier null collisions
     bare: mi.Float  # ω without the factor W
     mass: mi.Float  # sum of m over all null collisions of the flight
     number: mi.Float  # number of null collisions of the flight
@@ -189,7 +189,7 @@ class Shadow:
 
     T: mi.Spectrum  # estimate of the transmittance, 0 if occluded
     y: mi.Float  # distance of the point at which the transmittance is differentiated
-    medium: mi.MediumPtr  # the medium at y; null if the ray crosses no medium
+    medium: mi.MediumPtr  # the medium at distance y; null if the ray crosses no medium
     length: mi.Float  # length of the ray inside media
 
 
@@ -259,7 +259,7 @@ class SampledStep(Step):
 
     @property
     def seen(self) -> mi.Bool:
-        """Mitsuba's alpha: the ray hit a surface or had a collision, and is not passed on unscattered."""
+        """Mitsuba's alpha: whether the ray hit a surface or had a collision, and does not continue unscattered."""
         return self.signature.met & ~self.null
 
 

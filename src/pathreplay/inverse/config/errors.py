@@ -35,7 +35,7 @@ _KINDS = {
     "masks": "file names, or a pattern such as 'masks/*.png'",
 }
 
-# New names of renamed keys. If there are several new names, the one that exists in the table applies.
+# New names of renamed keys. An old key with several new names had a different meaning in each table.
 RENAMED = {
     "rival": "baseline",
     "learning_rate_decay": "final_learning_rate_ratio",
@@ -65,15 +65,15 @@ RENAMED = {
 
 
 def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[str, type[BaseModel]]) -> str:
-    """Describe the most telling error in one line: location, value and remedy.
+    """Describe one error of a job in a single line: location, value and remedy. Unknown keys are described first.
 
     Args:
         error: pydantic's error for a whole job.
         job: model of the job.
-        tables: models of the tables in the job, by key.
+        tables: models of the tables that a job may contain, by key.
     """
     details = error.errors()
-    # A value of a union type fails once per alternative. An unknown key is the most telling of these failures.
+    # A value of a union type yields one error per alternative. An unknown key is the most informative of these errors.
     first = next((e for e in details if e["type"] == "extra_forbidden"), details[0])
     where = ".".join(_path(first["loc"])) or "the job"
     if first["type"] == "extra_forbidden":
@@ -88,7 +88,7 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
         return f"key '{where}' is missing; add it"
     if first["type"] == "value_error":
         reason = str(first["ctx"]["error"])
-        # Validators of tables name the table in their messages. Validators of numbers do not name the key.
+        # Messages about tables already name the table. Messages about numbers lack the key, which is added here.
         return f"'{where}': {reason}" if isinstance(first["input"], Real) else reason
     # If several alternatives failed, describe all types that the key accepts.
     kinds = next((kinds for key, kinds in _KINDS.items() if key in _path(first["loc"])), None)

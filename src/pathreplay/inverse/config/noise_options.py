@@ -10,7 +10,7 @@ from pathreplay.inverse.config.tables import Count, Positive, Table
 
 AUTO = "auto"
 
-# The discriminator makes invalid values fail as numbers, which gives the better message.
+# All values except "auto" are validated as integers. An error message then describes the integer that is expected.
 Spp = Annotated[
     Annotated[Count, Tag("count")] | Annotated[Literal["auto"], Tag("auto")],
     Discriminator(lambda value: "auto" if isinstance(value, str) and value == AUTO else "count"),
@@ -20,7 +20,7 @@ Spp = Annotated[
 class AdaptiveSpp(Table):
     """Target signal-to-noise ratio and bounds of the samples per pixel, for ``spp = "auto"``.
 
-    The number of samples is always a power of two, because each number needs a new recording of the passes.
+    The number of samples is always a power of two, because kernels must be recorded again for each new number.
     """
 
     target_snr: Positive = 1.0

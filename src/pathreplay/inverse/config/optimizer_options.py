@@ -56,7 +56,7 @@ class Optimizer(Table):
 
     @property
     def searches(self) -> bool:
-        """Whether the optimiser compares losses between iterations, all of which then use the same random numbers."""
+        """Whether the optimiser compares losses of different iterations. If so, all use the same random numbers."""
         return self.type == "l-bfgs-b"
 
     def options(self) -> Json:

@@ -17,7 +17,7 @@ class ImageValue(Table):
     image: str
     """Image file, or 'matplotlib:NAME' for a sample image of matplotlib."""
     fit: Literal["stretch", "crop"] = "stretch"
-    """'stretch' resamples the image to the shape of the texture; 'crop' first crops its centre to the aspect ratio."""
+    """'stretch' resamples the image to the shape of the texture. 'crop' first crops the image to this aspect ratio."""
     raw: Switch = False
     """Use the stored values without decoding them from sRGB."""
 
@@ -34,7 +34,7 @@ def _import_path(value: str) -> str:
 
 
 ImportPath = Annotated[str, AfterValidator(_import_path)]
-"""``module:function``."""
+"""Name of a function, written as ``module:function``."""
 
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
@@ -93,7 +93,7 @@ class Parameter(Table):
     """Iterations at which the second and each later resolution begin; default: the first iterations of the stages, if
     there are as many stages as resolutions."""
     pyramid: Switch = False
-    """Take the steps in the levels of a Laplacian pyramid of a texture or volume."""
+    """Optimise the levels of a Laplacian pyramid instead of the entries of a texture or volume."""
     pose: PoseKind | None = None
     """Optimise a rigid motion of the parameter, which is a to_world transform or the vertex_positions of a mesh."""
     pivot: Vector | None = None
@@ -101,7 +101,7 @@ class Parameter(Table):
     error_scale: Positive | None = None
     """Reference length; the report also gives the position error of a pose as a fraction of this length."""
     rotation_learning_rate: Positive | None = None
-    """Learning rate of the rotation in degrees; default: learning_rate, taken in radians."""
+    """Learning rate of the rotation in degrees. Default: the value of learning_rate, in radians."""
     large_steps_lambda: Positive | None = None
     """Smoothness λ of Large Steps (Nicolet et al. 2021), for vertex_positions."""
     parameterization: TransformKind | None = None
@@ -155,7 +155,7 @@ class Parameter(Table):
                 "steps; remove one"
             )
         sizes, begins = self.resolutions or [], self.refine_at or []
-        # Without refine_at, the stages of the job may define the iterations (see `Config.completed_entry`).
+        # If refine_at is missing, `Config.completed_entry` may derive the iterations from the stages of the job.
         if self.refine_at is not None and len(begins) != max(0, len(sizes) - 1):
             self._refuse_count()
         if sorted(set(begins)) != begins:

@@ -23,7 +23,7 @@ YAML = (".yaml", ".yml")
 """Suffixes of YAML files. The suffix `.json` selects JSON, and any other suffix TOML."""
 
 _LONGEST, _LONGEST_YAML = 64 * 2**20, 2**18
-"""Maximum size of a job file in bytes, for TOML or JSON and for YAML. PyYAML takes seconds for 2**18 bytes."""
+"""Maximum size in bytes of a TOML or JSON file, and of a YAML file. PyYAML takes seconds for 2**18 bytes."""
 
 _DEEPEST = 64
 """Maximum nesting depth of YAML. PyYAML uses several stack frames per level."""
@@ -56,7 +56,7 @@ def from_toml(text: str) -> Json:
 class _Plain(yaml.SafeLoader):
     """Loader of the YAML 1.2 core schema: `no` is a string, `1e-3` a number, and `12:30` a string.
 
-    Duplicate keys and tags are errors, and so are anchors, which can expand a few lines to billions of nodes.
+    Duplicate keys, tags and anchors are errors. Anchors could expand a few lines to billions of nodes.
     """
 
     yaml_implicit_resolvers: ClassVar[dict[str, list[object]]] = {}

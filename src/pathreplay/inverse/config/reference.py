@@ -61,7 +61,7 @@ def _default(about: Json) -> str:
 
 
 def _kind(about: Json) -> str:
-    """Describe the types of a key's values. Only error messages describe the ranges of values."""
+    """Describe the types of a key's values. The description does not contain the range of the values."""
     return " or ".join(dict.fromkeys(_kinds(about)))
 
 

@@ -75,7 +75,7 @@ class Config(Table):
     measure_snr: Switch = False
     """Compute each gradient from two halves of the samples to estimate its signal-to-noise ratio."""
     max_consecutive_nonfinite: Count = 10
-    """Number of consecutive iterations with half of a gradient or more NaN or infinite after which the run ends."""
+    """End the run after this many consecutive iterations in which half of a gradient or more is NaN or infinite."""
     view_batch_size: Count | None = None
     """Number of views per iteration, drawn without repetition; the seed determines the order. Default: all."""
     pixel_batch_size: Count | None = None
@@ -161,7 +161,7 @@ class Config(Table):
         total = begins(self.stages or [])[-1]
         if self.stages is not None:
             if "iterations" not in self.model_fields_set:
-                # Assigned in __dict__, because the model is frozen, and the key must not count as given in a saved job.
+                # The model is frozen, so the key is set in __dict__. The key does not count as given, and is not saved.
                 self.__dict__["iterations"] = total
             elif self.iterations != total:
                 raise ValueError(
@@ -210,7 +210,7 @@ class Config(Table):
             "final_learning_rate_ratio" in self.model_fields_set
             and "learning_rate_schedule" not in self.model_fields_set
         ):
-            # Assigned in __dict__, because the model is frozen, and the key must not count as given in a saved job.
+            # The model is frozen, so the key is set in __dict__. The key does not count as given, and is not saved.
             self.__dict__["learning_rate_schedule"] = "exponential"
         if self.learning_rate_schedule == "constant" and "final_learning_rate_ratio" in self.model_fields_set:
             raise ValueError(

@@ -24,7 +24,7 @@ def _single(value: object) -> object:
         return value
     try:
         number = float(value)
-    except OverflowError:  # an integer beyond double precision
+    except OverflowError:  # the integer exceeds the range of double precision
         number = 2 * LARGEST
     if math.isfinite(number) and abs(number) > LARGEST:
         raise ValueError(f"{shown(value)} exceeds the range of single precision; give a number up to {LARGEST:.3g}")
@@ -49,7 +49,7 @@ class Table(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _is_a_table(cls, value: object) -> object:
-        """Reject mappings other than dictionaries, such as Dr.Jit optimizers, which have none of the keys."""
+        """Reject mappings that are not dictionaries, such as Dr.Jit optimizers. Their keys are not keys of a job."""
         if isinstance(value, Mapping) and not isinstance(value, dict):
             raise PydanticCustomError("table_type", "input should be a dictionary")
         return value
@@ -60,7 +60,7 @@ Argument = Switch | Whole | Finite | str
 
 
 class Plugin(BaseModel):
-    """A Mitsuba plugin: its type and its options, which Mitsuba checks."""
+    """A Mitsuba plugin: its type and its options. The options are checked by Mitsuba."""
 
     model_config = ConfigDict(extra="allow", frozen=True, use_attribute_docstrings=True)
 

@@ -45,7 +45,7 @@ class Target(Table):
             if self.masks is not None and self.alpha == "mask":
                 raise ValueError("target: 'masks' and alpha = 'mask' both define a mask; remove one of them")
         elif self.model_fields_set <= {"alpha"}:
-            return self  # the images may come from a capture; `Config` checks that
+            return self  # `Config` checks that a capture provides the images
         elif self.alpha != "black":
             raise ValueError(f"target: alpha = '{self.alpha}' applies to 'images' only; remove it, or give 'images'")
         elif not self.values and self.scene is None:
@@ -94,9 +94,10 @@ class Exposure(Table):
     white_balance: Switch = False
     """Recover one factor per colour channel instead of one per view."""
     reference: Whole | str | None = None
-    """View whose factor is fixed at 1; default: the geometric mean of all factors is fixed at 1."""
+    """View whose factor is fixed at 1. Default: fix the geometric mean of the training views' factors at 1."""
     fix_scale: Switch = True
-    """Fix the common scale of all factors; set it to false if the brightness of the emitters is known."""
+    """Fix the common scale of the factors. Set it to false if the brightness of the emitters is known: the images then
+    determine this scale."""
     learning_rate: Positive | None = None
     """Learning rate of the logarithm of each factor; default: the learning rate of the job."""
 

@@ -16,7 +16,7 @@ MOST_FILES = 100_000
 
 
 def matching(names: Iterable[str], base: Path) -> Iterator[str]:
-    """Yield the names, after replacing wildcards in their last part (photos/*.png) by matching files in natural order.
+    """Yield file names. A name with wildcards in its last part (photos/*.png) yields matching files in natural order.
 
     Raises PathreplayError if no file matches a pattern, or if the name of a folder has wildcards.
     """

@@ -42,7 +42,8 @@ from pathreplay.scenes.image_files import MOST_PIXELS
 from pathreplay.scenes.loading import load_scene_with_floats
 from pathreplay.scenes.stored import form_of
 
-# Bytes per pixel of a view, for its target, initial and final image. Images beyond `ROOM` bytes are on disk.
+# Bytes per pixel for the three images of a view: target, initial and final image. At most `ROOM` bytes of images are in
+# memory, and the rest is on disk.
 _A_VIEW = 36
 
 
@@ -57,7 +58,7 @@ class Targets:
 
     @staticmethod
     def of(views: Iterable[View]) -> Targets:
-        """Collect the targets of views."""
+        """Return the target images and pixel weights that these views contain."""
         views = tuple(views)
         weights = {view.name: view.weight for view in views if view.weight is not None}
         return Targets({view.name: view.target for view in views}, weights)
@@ -66,7 +67,10 @@ class Targets:
 def target_scene(
     spec: str, arguments: Mapping[str, Argument], given: Mapping[str, Value], wanted: Sequence[str], base: Path
 ) -> mi.Scene:
-    """Load the target scene and set its ``given`` values. 8-bit textures with given or wanted keys become floats."""
+    """Load the target scene, and set the parameters ``given`` (globs allowed) to their values.
+
+    8-bit textures that match a key in ``given`` or ``wanted`` are converted to floats.
+    """
     scene = load_scene_with_floats(spec, [*given, *wanted], base, **arguments)
     params = traversed(scene)
     parameters.require_finite(params)
@@ -82,11 +86,11 @@ def target_scene(
 
 
 def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> dict[str, Array]:
-    """Return the true values of those parameters that the target scene has in a `comparable` shape.
+    """Return the values of parameters in the target scene. Parameters whose shape is not `comparable` are left out.
 
     Args:
         scene: the target scene.
-        own: parameters of the scene of the job.
+        own: parameters of the job's scene, with which shapes are compared.
         keys: keys of the parameters.
     """
     params = traversed(scene)
@@ -200,7 +204,7 @@ def _kinds(lenses: Mapping[str, Lens]) -> str:
 
 
 def _require_alpha(what: str, image: Image, alpha: str, name: str, shape: tuple[int, int, int]) -> None:
-    """Raise PathreplayError unless the image and the film support this ``alpha``."""
+    """Raise PathreplayError unless the channels of image and film are suitable for the option ``alpha``."""
     if alpha != "black" and image.shape[2] not in (2, 4):
         remedy = "give 'masks'" if alpha == "mask" else "add one"
         raise PathreplayError(f"{what} has no alpha channel for alpha = '{alpha}'; {remedy}, or remove 'alpha'")
@@ -251,7 +255,7 @@ def masked(targets: Targets, masks: Mapping[str, Image]) -> Targets:
 
 
 def require_weights(targets: Targets, masked: set[str]) -> None:
-    """Raise PathreplayError unless exactly the views ``masked`` have weights, and these weights are valid."""
+    """Raise PathreplayError unless all views in ``masked``, and no others, have weights, and all weights are valid."""
     for name, image in targets.images.items():
         weight = targets.weights.get(name)
         shape = (*image.shape[:2], 1)
@@ -301,7 +305,7 @@ def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str,
     Args:
         scene: the scene.
         sensors: index of each sensor, by name.
-        spp: samples per pixel, by the key that sets them.
+        spp: samples per pixel by the key of the job that defines them, such as ``eval_spp``.
     """
     pixels = 0
     for name, index in sensors.items():

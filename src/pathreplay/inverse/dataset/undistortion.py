@@ -23,7 +23,7 @@ from pathreplay.inverse.images.io import Image
 Plane = NDArray[np.float64]
 
 OFF = 0.5
-"""Error at the image border, in pixels, up to which pixels are treated as square."""
+"""Tolerance on square pixels: largest displacement in pixels, at the image border, if fy is replaced by fx."""
 _STEPS = 2048
 """Number of radii at which the monotonicity of a lens is tested."""
 

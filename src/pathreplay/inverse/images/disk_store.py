@@ -37,11 +37,14 @@ class DiskStore:
 
     @staticmethod
     def of(budget: int | None) -> DiskStore:
-        """Make a store that uses at most an eighth of a run's memory limit of ``budget`` bytes (None: no limit)."""
+        """Make a store of at most ``budget`` / 8 bytes in memory. ``budget`` is the run's memory limit, or None."""
         return DiskStore(ROOM if budget is None else min(ROOM, budget // 8))
 
     def keep(self, array: Array) -> Array:
-        """Return the array itself or a read-only copy on disk. Raises PathreplayError if the disk is full."""
+        """Return the array itself if it fits into memory, or a read-only copy on disk.
+
+        Raises PathreplayError if the disk is full.
+        """
         if array.nbytes <= SMALL or array.nbytes <= self.room:
             self.room -= array.nbytes
             return array

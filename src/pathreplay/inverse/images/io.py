@@ -91,7 +91,7 @@ def _linear(bitmap: mi.Bitmap) -> Image:
     formats = mi.Bitmap.PixelFormat
     if bitmap.pixel_format() in (formats.XYZ, formats.XYZA):
         bitmap = bitmap.convert(pixel_format=formats.RGB if bitmap.channel_count() == 3 else formats.RGBA)
-    # Other bitmaps are already linear. Mitsuba's conversion is avoided, because it relies on the names of channels.
+    # Linear bitmaps of floats are not converted, because Mitsuba's conversion relies on the names of channels.
     if bitmap.srgb_gamma() or bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16):
         bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
     return np.asarray(bitmap).astype(np.float32, copy=False)
@@ -152,7 +152,7 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def oddities(path: Path) -> list[str]:
-    """List the metadata of an image that is ignored. Each entry is a predicate for a message about the image."""
+    """Describe ignored metadata of an image. Each description begins with a verb and follows the image name."""
     notes = []
     # `read_image` reports errors. Pillow's warnings about large images are irrelevant here.
     with contextlib.suppress(Exception), warnings.catch_warnings():
@@ -184,7 +184,7 @@ def with_channels(image: Image, channels: int) -> Image | None:
 
 
 def over_black(image: Image, path: Path) -> Image:
-    """Premultiply the colours of an image file by its alpha, as in rendered images, and keep alpha.
+    """Multiply the colours of an image file by its alpha, and keep alpha. Rendered images are premultiplied, too.
 
     EXR files already store premultiplied colours. All other formats store straight alpha.
     """
@@ -215,7 +215,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
 
 def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Image:
-    """Resample an image (Lanczos, clamped to its range), after a centre crop to the new aspect ratio if ``crop``."""
+    """Resample an image (Lanczos, clamped to its range). If ``crop``, first crop its centre to the new aspect ratio."""
     if crop:
         h, w = image.shape[:2]
         keep_h, keep_w = min(h, round(w * height / width)), min(w, round(h * width / height))

@@ -39,7 +39,7 @@ class Likeness:
             exposure: factor on both images.
             weight: weights of the pixels with mean 1, shape (height, width, 1); None weights all equally.
             flip: whether to compute FLIP (Andersson et al. 2020, 67 pixels per degree) with NVIDIA's package
-                flip-evaluator. The result is None if the package is not installed.
+                flip-evaluator. The FLIP value is None if the package is not installed.
         """
         a, b = (displayed(picture, exposure) for picture in (image, target))
         w = np.ones((1, 1, 1)) if weight is None else weight.astype(np.float64)

@@ -41,7 +41,7 @@ class Entry:
     errors: dict[str, float] = field(default_factory=dict)
     """Errors after the step: RMS errors of variables with a known true value, and errors of poses (`PoseError.of`)."""
     picture_error: float | None = None
-    """RMS error of the images without rendering noise, measured in some iterations of runs with a baseline."""
+    """RMS error of the images without rendering noise (`image_error`). None in iterations that do not measure it."""
     penalty: FiniteFloat = 0.0
     """Sum of all regularizers."""
     spp: NonNegativeInt = 0
@@ -49,7 +49,7 @@ class Entry:
     noise_norms: dict[str, float] = field(default_factory=dict)
     """L2 norms of the noise of the gradients, if the job measures it (see `noise`)."""
     dropped_shares: dict[str, float] = field(default_factory=dict)
-    """Dropped entries as a fraction of the entries of a variable in all views."""
+    """Fraction of a variable's gradient entries, over all views, that were NaN or infinite and counted as zero."""
     slopes: dict[str, list[float]] = field(default_factory=dict)
     """Sums of each gradient over parts of its variable (see `movement`)."""
     means: dict[str, list[float]] = field(default_factory=dict)
@@ -65,7 +65,7 @@ class Run:
     values: dict[str, Array]
     """Decoded values of the variables, by key."""
     learned: Arrays = field(default_factory=dict)
-    """Statistics that evaluations pass on to later evaluations, such as the learned baselines of media, by name."""
+    """State that evaluations pass on to later evaluations, by name, such as the control variates of media."""
     history: list[Entry] = field(default_factory=list)
     baseline: Run | None = None
     """A run of another integrator for comparison, with the same initial values and the same computation time."""

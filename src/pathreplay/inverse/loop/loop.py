@@ -54,7 +54,7 @@ from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, s
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
 
-# Number of measurements of the image error in a job with a baseline. They take a few per cent of the job's time.
+# Number of times that a job with a baseline measures the image errors. This takes a few per cent of the job's time.
 JUDGEMENTS = 10
 
 # Smallest fraction of non-finite gradient entries for which an iteration counts towards `max_consecutive_nonfinite`.
@@ -94,7 +94,7 @@ def optimiser_of(problem: Problem, values: Arrays, options: Optimizer, search: S
     """Create the optimiser of the problem's variables at these values. For ``search`` see `LineSearch`."""
     values = latents(problem.variables, values)
     if options.searches:
-        free = -np.inf, np.inf  # coordinates enforce the bounds themselves
+        free = -np.inf, np.inf  # `v.coordinates` already keep values within bounds
         bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}
         return LineSearch(values, options, bounds, search)
     uniform = [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
@@ -159,7 +159,7 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
 
 
 def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
-    """Yield the events of `iterate`. Its steps run inside `Problem.computing`, and observers of events outside."""
+    """Yield the events of `iterate`. Steps run inside `Problem.computing`; the consumer of the events does not."""
     events = iterate(problem, run, stop)
     while True:
         with problem.computing():
@@ -348,7 +348,7 @@ def _plain(problem: Problem, view: View, spp: int) -> Image:
 
 
 def ended(problem: Problem, run: Run) -> Run:
-    """Return the run with its resulting values and exposures of test views. The baseline is changed in place."""
+    """Return a copy of the run with `best_values`. Fit the exposures of test views in the copy and in its baseline."""
     run = replace(run, values=best_values(problem, run))
     for each in filter(None, (run, run.baseline)):
         each.values = dict(with_exposures(problem, each.values))
@@ -356,7 +356,7 @@ def ended(problem: Problem, run: Run) -> Run:
 
 
 def with_exposures(problem: Problem, values: Arrays) -> Arrays:
-    """Return the values with exposures of test views, which the run does not optimise, fitted to their targets."""
+    """Fit the exposures of test views, which the run does not optimise, to their targets. Return all values."""
     if EXPOSURE not in values or not any(view.is_test for view in problem.views):
         return values
     put_values(problem, values)

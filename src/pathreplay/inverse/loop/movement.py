@@ -2,7 +2,8 @@
 
 The noise of gradients is independent between iterations. The standard error of the mean gradient over a window of n
 iterations is therefore the standard deviation of the gradients divided by √n. The expected gradient is zero at
-convergence, and nonzero before, however small the steps are.
+convergence and nonzero before. This holds for any step size, so small steps are not mistaken for
+convergence.
 
 A variable also counts as converged if its gradient is small relative to the initial gradient. Near a minimum, the loss
 is quadratic, so the remaining distance is proportional to the gradient.
@@ -42,7 +43,7 @@ def parts_of(array: Array, mean: bool = False) -> list[float]:
 
 
 def window_of(history: Sequence[Entry], begin: int = 0) -> Sequence[Entry]:
-    """Return the last third of the iterations since ``begin``, at least `SHORTEST`, or none if there are fewer."""
+    """Return the last max(n / 3, `SHORTEST`) of the n iterations since ``begin``, or none if n < `SHORTEST`."""
     count = len(history) - begin
     return history[-max(count // 3, SHORTEST) :] if count >= SHORTEST else ()
 
@@ -52,7 +53,8 @@ def still_moves(history: Sequence[Entry], key: str, begin: int = 0) -> bool | No
 
     Let g be the sum of the gradient over a part of the variable. The test statistic of the part is
     t = √n mean(g) / std(g) over a window of n iterations. If gradients are pure noise, the mean of t² over m parts is
-    about 1 ± √(2/m). Parts that stay constant, e.g. at a bound, are excluded.
+    about 1 ± √(2/m). The variable moves if this mean exceeds 1 + 7 √(2/m), and the gradient exceeds `LEFT` times the
+    initial gradient. Parts that stay constant, e.g. at a bound, are excluded.
     """
     window = [entry for entry in window_of(history, begin) if key in entry.slopes]
     first = [entry for entry in history[begin:] if key in entry.slopes][:_FIRST]

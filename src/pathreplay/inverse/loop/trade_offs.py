@@ -27,21 +27,22 @@ from pathreplay.inverse.problem.problem import Problem
 FEW = 4
 """Maximum number of entries of a variable that are perturbed one by one. Larger variables are scaled as a whole."""
 MOST_COLUMNS, MOST_PIXELS, MOST_ROWS = 16, 2**23, 2**20
-"""Maximum number of columns of J, of pixels of all views, and of rows of J. More rows are subsampled evenly."""
+"""Maximum number of columns of J, of pixels in all views, and of rows of J. If J has more rows, every k-th is used."""
 MOST_SAMPLES, FREE_SAMPLES, SHARE = 16, 2**22, 0.1
-"""Maximum number of samples per pixel, and budget of samples in total. The budget is `FREE_SAMPLES`, or the fraction
-`SHARE` of the run's samples if that is more."""
+"""`MOST_SAMPLES` is the maximum number of samples per pixel. The total number of samples is limited to `FREE_SAMPLES`,
+or to the fraction `SHARE` of the run's samples if that is more."""
 STEP = 0.01
-"""Size of a perturbation, as a fraction of the sum of value, change during the run and learning rate."""
+"""Size of a perturbation relative to the sum of three numbers: value, change during the run, and learning rate."""
 UNDONE = 0.05
-"""Sine of the angle below which two parameters are a trade-off. This fraction of a change cannot be undone."""
+"""Two parameters are a trade-off if the sine of their angle is below this value. The sine is the fraction of a change
+of the images by one parameter that the other parameter cannot undo."""
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Columns of the Jacobian by variable, shape (pixels, entries)."""
 
 
 def trade_offs(columns: Columns) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of variables whose effects on the images cancel up to `UNDONE`."""
+    """Return the pairs of variables whose principal angle has a sine below `UNDONE`."""
     spans = {key: np.linalg.qr(column / np.linalg.norm(column, axis=0))[0] for key, column in columns.items()}
     pairs = []
     for a, b in combinations(spans, 2):
@@ -101,7 +102,7 @@ def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
 
 
 def _changes(variable: Variable, value: Array, few: int = FEW) -> list[Array]:
-    """Make small perturbations of a value: one per entry, or one that scales a value with more than ``few`` entries."""
+    """Make small perturbations of a value: one per entry, or a single one if there are more than ``few`` entries."""
     size = STEP * variable.learning_rate
     if value.size <= few:
         size += STEP * (_length(value) + _length(value - variable.start))

@@ -69,9 +69,9 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
         columns, unseen = columns_of(problem, run.values, taken)
         pairs = trade_offs(columns)
     except (PathreplayError, RuntimeError, ValueError, np.linalg.LinAlgError):
-        # User functions or Mitsuba may reject perturbed values; the run itself has succeeded.
+        # User functions or Mitsuba may reject perturbed values. This is no error of the run, which has succeeded.
         return Verdict(moving, arrived)
-    # A perturbation may be too small to move a silhouette across any sample, although the gradient is not zero.
+    # Variables with a nonzero gradient affect the images, even if a perturbation moves no silhouette across a sample.
     pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
     return Verdict(moving, arrived, pairs, tuple(key for key in unseen if key not in pulled))
 

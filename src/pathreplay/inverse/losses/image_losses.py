@@ -19,7 +19,7 @@ from pathreplay.scenes.descriptions import one_line
 if TYPE_CHECKING:
     import torch
 
-# Fraction of the target's mean square. The scale factor tends to 0 for images whose mean square is smaller.
+# Term in the denominator of the scale factor s, relative to the target's mean square. Nearly black images get s ≈ 0.
 _BLACK = 1e-9
 
 

@@ -55,7 +55,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Contribution of a shard to the loss, which is the mean over the training views, and to its gradients by key.
+    """Contribution of a shard to the loss (the mean over the training views) and to the gradients, indexed by key.
 
     Gradients are unbiased for the losses in `QUADRATIC`. The expected loss includes the variance of the images.
     """
@@ -85,7 +85,7 @@ class Total:
         self._dropped: Counter[str] = Counter()
 
     def add(self, each: Evaluation) -> None:
-        """Add an evaluation in place. If ``owned``, the arrays of the first evaluation are overwritten."""
+        """Add an evaluation. In an ``owned`` sum, later additions overwrite the arrays of the first evaluation."""
         for key, gradient in each.gradients.items():
             if self._count:
                 gradient = np.add(self._sums[key], gradient, out=self._room(key))
@@ -98,7 +98,7 @@ class Total:
         self._count += 1
 
     def _room(self, key: str) -> Array | None:
-        """Return the array of a sum if it may be overwritten, or None. Arrays from other processes are read-only."""
+        """Return the array of a sum, or None if it must not be overwritten (e.g. read-only, from another process)."""
         here = self._sums[key]
         return here if self._owned and here.flags.writeable else None
 
@@ -186,14 +186,14 @@ class Evaluator:
         self._moving = frozenset((v.key for v in problem.variables) if moving is None else moving)
         self._reached = problem.reached(self._moving)
         has_media = facts_of(problem.scene).has_media
-        # Recording splits kernels differently from tracing, which changes results in the last bit.
+        # Deterministic jobs do not record, since recorded kernels are split differently. This changes the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(self.integrator, has_media) and problem.loss not in ELSEWHERE
-        self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
-        # Whether a pixel sweep is possible, by view, samples per pixel, and whether pixels are batched.
+        self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # Keys: samples per pixel.
+        # Whether a pixel sweep is possible. Keys: view, samples per pixel, and whether pixels are batched.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
-        self._learned: Arrays = {}  # state of the integrator after the last evaluation
-        self._at: object = None  # the integrator's object for this state, which another evaluator may replace
+        self._learned: Arrays = {}  # State of the integrator after the last evaluation.
+        self._at: object = None  # Object that represents this state. Another evaluator may replace it.
         self._begun = False
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
@@ -235,8 +235,8 @@ class Evaluator:
             return self._view(values, view, seed, spp, pixels)
         gradients = {}
         for key, value in moving.items():
-            gradients[key] = _taken(dr.grad(value))  # zero if no parameter affects the view
-            dr.clear_grad(value)  # the scene keeps a reference to the variable
+            gradients[key] = _taken(dr.grad(value))  # The gradient is zero if no parameter affects the view.
+            dr.clear_grad(value)  # The scene keeps a reference to the variable, and thus its gradient.
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())

@@ -45,7 +45,7 @@ class ViewTarget:
     """Factor on the rendered image, see `exposures`."""
 
     def compared(self, loss: Loss, image: mi.TensorXf) -> mi.Float:
-        """Return the mean loss of a rendered image, after multiplication by the factor."""
+        """Multiply a rendered image by the factor, and return its mean loss."""
         return mean_loss(loss, _times(image, self.factor), self.target, self.weight).array
 
 
@@ -163,7 +163,7 @@ def _differentiate(
     share = loss.share if batch is None else loss.share * batch.share
     if loss.swept:
         offset, slope = (term * share for term in linear_derivative(loss.loss, target.target, target.weight))
-        # The loss sees factor * image. By the chain rule, offset is multiplied by the factor, and slope by its square.
+        # Chain rule: the loss is evaluated at factor * image, so offset is multiplied by factor and slope by factor².
         wanted = _times(offset, factor), _times(_times(slope, factor), factor)
         image, state = integrator.pixel_pass(view, wanted, None if batch is None else batch.pixels, state)
         value = target.compared(loss.loss, image) * share
@@ -174,7 +174,7 @@ def _differentiate(
         value = target.compared(loss.loss, image) * share
         if dr.grad_enabled(value):
             dr.backward(value)
-            apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # derived as in `mi.render`
+            apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # the seed that `mi.render` would use
             state = integrator.gradient_pass(apart, dr.grad(image), state)
     by_factor = None
     if factor is not None:

@@ -16,7 +16,8 @@ from pathreplay.inverse.problem.joint import JointProblem
 class JointEvaluator:
     """Evaluates each shard of a joint problem with the evaluator of its scene.
 
-    All views of a shard belong to one scene. Names of learned state begin with the index of the scene.
+    All views of a shard belong to one scene. In the learned state, the names of arrays begin with the
+    index of the scene.
     """
 
     def __init__(self, problem: JointProblem, parts: Sequence[Evaluate]) -> None:

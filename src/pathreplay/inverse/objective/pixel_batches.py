@@ -22,7 +22,7 @@ class Batch:
 
     pixels: mi.UInt32
     share: float
-    """Fraction of the image's pixels that have a nonzero weight, from which the batch is drawn."""
+    """Fraction of the image's pixels that have a nonzero weight. The batch is drawn from these pixels."""
 
     @staticmethod
     def of(weight: Array | None, size: tuple[int, int], most: int, seed: int) -> Batch | None:
@@ -45,7 +45,10 @@ class Batch:
 
 
 def obstacle(problem: Problem, integrator: StatefulIntegrator, sensor: int, spp: int, some: bool) -> str:
-    """Return why one pass over all pixels, or over ``some``, cannot give image and gradient, or "" if it can."""
+    """Return why a single pass cannot compute both image and gradient of a view, or "" if it can.
+
+    ``some`` selects a pass over a batch of pixels instead of all pixels.
+    """
     if problem.loss not in QUADRATIC:
         return "its loss is none of l2 and relative-l2; take one of these"
     return integrator.why_no_pixel_sweep(problem.scene, problem.scene.sensors()[sensor], spp, some)

@@ -28,9 +28,9 @@ def require_possible(problem: Problem) -> None:
 
 
 def require_reached(problem: Problem) -> None:
-    """Raise PathreplayError if the variables of a stage, or of a job without stages, affect none of its views.
+    """Raise PathreplayError if the variables of a stage affect no view of the stage.
 
-    The error is also raised if the integrator does not differentiate the variables.
+    A job without stages counts as one stage. The integrator must also differentiate the variables.
     """
     for part in parts_of(problem):
         where = f"stages: stage {part.number + 1}: " if part.stage else ""

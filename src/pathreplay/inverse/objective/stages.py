@@ -87,7 +87,7 @@ def _moving(problem: Problem, stage: Stage) -> list[str]:
     keys = [v.key for v in problem.variables]
     if stage.parameters is None:
         return keys
-    # The key of a pose or of a derived parameter also names the variables from which it is computed.
+    # If a stage names a pose or a derived parameter, it optimises the variables from which the parameter is computed.
     owners: dict[str, set[str]] = {key: {key} for key in keys}
     for each in problem.made():
         for part in each.of:
@@ -101,7 +101,7 @@ def _moving(problem: Problem, stage: Stage) -> list[str]:
 
 
 def require_stages(problem: Problem) -> None:
-    """Raise PathreplayError unless all stages are possible with this scene."""
+    """Raise PathreplayError unless films and integrators suit all stages, and some stage optimises each variable."""
     config = problem.config
     for number, stage in enumerate(config.stages or []):
         part = _part(problem, number, stage)
@@ -130,7 +130,7 @@ def require_single_pixels(problem: Problem) -> None:
 
 def _require_single_pixels(part: Part, integrator: mi.Integrator) -> None:
     problem = part.problem
-    spp = int(problem.config.spp) // problem.config.parts  # pixel batches exclude spp = "auto"
+    spp = int(problem.config.spp) // problem.config.parts  # spp is a number, since pixel batches exclude "auto"
     for view in problem.trained().values():
         camera = f"{problem.scene.sensors()[view.sensor].id()}."
         why = obstacle(problem, stateful(integrator), view.sensor, spp, some=True)

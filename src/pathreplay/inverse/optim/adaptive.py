@@ -105,7 +105,7 @@ class DrJitOptimiser:
         return self._parts[self._is_uniform(key)]
 
     def _pieces(self, key: str) -> dict[str, slice]:
-        """Return the pieces of a variable by their names in Dr.Jit's optimiser. Uniform variables are one piece."""
+        """Return the pieces of a variable by name in Dr.Jit's optimiser. UniformAdam needs a single piece."""
         size = prod(self._shapes[key])
         length = max(size, 1) if self._is_uniform(key) else self._piece
         return {f"{key}:{begin}": slice(begin, min(begin + length, size)) for begin in range(0, size, length)}

@@ -4,10 +4,12 @@ With interpolations U_j from level j to the resolution of the grid, the grid is
 
     v = Σ_j U_j u_j,        so that        ∂/∂u_j = U_jᵀ ∂/∂v.
 
-An optimiser that normalises each entry by its own moments, such as Adam, then moves low frequencies as fast as a coarse
-grid would, with the gradient noise of a coarse grid. Entries that no path reaches follow their surroundings (Weier et
-al. 2025). The levels of a given v are not unique. Steps depend on gradients only, so the finest level is v itself here
-and all others are zero. Neither needs to be kept between steps.
+An optimiser such as Adam normalises each entry by its own moments. In a pyramid, it moves low frequencies as fast as on
+a coarse grid, with the low gradient noise of that grid. Entries without a gradient of their own change along with their
+neighbours, through the coarse levels (Weier et al. 2025).
+
+A given v does not determine the levels. Before each step, v is assigned to the finest level, and all others are zero.
+The step depends on gradients only, and the levels are discarded after it.
 """
 
 from __future__ import annotations
@@ -28,12 +30,13 @@ Shape = tuple[int, ...]
 class Pyramid:
     """Coordinates (`Coordinates`) of a grid: the levels of a pyramid, coarsest first, in one flat array.
 
-    Each level has half the entries of the next one along each axis, rounded up; the coarsest has one entry per channel.
+    Each level has half as many entries along each axis as the next finer level, rounded up. The coarsest level has one
+    entry per channel.
 
     Args:
         shapes: all shapes that the grid may have, with the channels last.
-        wraps: whether the last axis but the channels is periodic, as in environment maps.
-        inner: coordinates of the entries; the pyramid is that of their latent variables. None: the values themselves.
+        wraps: whether the x axis (the one before the channels) is periodic, as in environment maps.
+        inner: coordinates of the entries, such as logarithms. The pyramid then represents the latent variables.
     """
 
     uniform = False
@@ -69,7 +72,7 @@ class Pyramid:
         return level if self.inner is None else self.inner.values(level)
 
     def _resize(self, level: Array, shape: Shape, transposed: bool = False) -> Array:
-        """Interpolate a level to another ``shape``, or apply the transpose of the interpolation from that shape."""
+        """Interpolate a level to ``shape``, or apply the transpose of the interpolation from ``shape`` to it."""
         last = len(shape) - 2
         for axis, n in enumerate(shape[:-1]):
             m = level.shape[axis]

@@ -13,7 +13,7 @@ from pathreplay.inverse.config.parameter_options import TransformKind
 from pathreplay.inverse.parameters.values import Array
 
 CLOSEST = 1e-6
-"""Minimum distance from a bound, relative to the range. Any closer, the derivative with respect to u would vanish."""
+"""Minimum distance from a bound, relative to the range. At a bound, dv/du = 0, and no step could leave it."""
 
 LARGEST_LOG = 88.0
 """Maximum logarithm of a value. The exponential of a larger number overflows in single precision."""

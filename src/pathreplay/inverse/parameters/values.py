@@ -69,7 +69,7 @@ def make_value(key: str, like: SceneValue, value: Value, base: Path) -> Array:
 
 
 def seen(params: mi.SceneParameters, key: str) -> SceneValue:
-    """Return the decoded value of a scene parameter, the form in which jobs give, optimise and save it (see `Form`)."""
+    """Return the decoded value of a scene parameter (see `Form`). Jobs contain, optimise and save decoded values."""
     return form_of(params, key).see(params[key])
 
 

@@ -66,7 +66,7 @@ class Variable:
 
 
 def latents(variables: Iterable[Variable], values: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the arrays that the optimiser steps at these ``values``, by key."""
+    """Convert ``values`` to the latent arrays that the optimiser steps, by key."""
     return {v.key: v.coordinates.latent(values[v.key]) if v.coordinates else values[v.key] for v in variables}
 
 
@@ -183,8 +183,8 @@ def make_variables(
         for part, name in pose.parts().items():
             start = np.array(getattr(entry.displacement, part) or [0.0, 0.0, 0.0], np.float32)
             if part == "rotation":
-                # The job gives rotations in degrees. Its general learning rate applies to radians, which suits a scene
-                # of size 1.
+                # Rotations are in degrees in the job and in radians here. ``learning_rate`` is in radians: points at a
+                # distance of 1 from the pivot then rotate as fast as translations move them.
                 start = np.radians(start)
                 degrees = entry.rotation_learning_rate
                 rate = rate if degrees is None else float(np.radians(degrees))
@@ -247,7 +247,7 @@ def _penalty(
 
 
 def _numbers(key: str, shape: list[int]) -> mi.TensorXf:
-    """Make a literal zero tensor. Raises PathreplayError if an array of its size does not fit into memory."""
+    """Make a tensor of literal zeros. Raises PathreplayError if a full array of this shape does not fit into memory."""
     parameter_limits.require_values({key: prod(shape)})
     return dr.zeros(mi.TensorXf, shape)
 
@@ -280,7 +280,7 @@ def _start(key: str, like: SceneValue, form: Form, entry: Parameter, base: Path,
     elif entry.initial is None:
         start = parameters.get_array(like)
     else:
-        assert not isinstance(entry.initial, Displacement)  # the schema allows these for poses only
+        assert not isinstance(entry.initial, Displacement)  # the schema allows displacements for poses only
         start = form.of_colours(key, make_value(key, like, entry.initial, base))
     for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
         if bound is not None and wrong(start, np.float32(bound)).any():

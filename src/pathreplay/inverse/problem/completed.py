@@ -1,4 +1,4 @@
-"""Default integrators of jobs, derived from the scene, and of rendered targets, derived from the job."""
+"""Derive the default integrator of a job from its scene, and the default integrator of targets from the job."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
 
 
 def _options(own: mi.Integrator | None) -> Json:
-    """Return options of `pathreplay` that correspond to the scene's integrator; empty if its limits are unknown."""
+    """Return options of `pathreplay` that match the scene's integrator, or none if its path limits are unknown."""
     limits = None if own is None else read_limits(own)
     if own is None or limits is None:
         return {}
     if options := stateful(own).options():
         return vars(limits) | options
-    # An unbounded max_depth, Mitsuba's default, is not copied, since `pathreplay` would trace unbounded paths twice.
+    # Mitsuba's default max_depth, -1 (unbounded), is not copied: `pathreplay` would have to trace each path twice.
     return {name: value for name, value in vars(limits).items() if name != "max_depth" or value >= 0}
 
 

@@ -14,7 +14,7 @@ from pathreplay.inverse.losses.pixelwise import Loss, mean_loss
 
 
 def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Raise PathreplayError if the scene has no shapes, and a key belongs to neither an emitter nor a sensor."""
+    """In a scene without shapes, raise PathreplayError if a key belongs to neither an emitter nor a sensor."""
     if scene.shapes():
         return
     visible = {

@@ -92,11 +92,11 @@ class Problem:
     params: mi.SceneParameters
     integrator: mi.Integrator
     baseline: mi.Integrator | None
-    """Integrator that solves the same problem in the same time, for comparison."""
+    """Integrator of a second run, which solves the same problem in the same time for comparison; None without it."""
     judge: mi.Integrator
-    """Integrator of the images by which ``integrator`` and ``baseline`` are compared.
+    """Integrator of the images in which the results of ``integrator`` and ``baseline`` are compared with the targets.
 
-    Rendered targets use the same integrator."""
+    This is the integrator that rendered the targets, or ``integrator`` if the targets are image files."""
     variables: tuple[Variable, ...]
     poses: tuple[Pose, ...]
     views: tuple[View, ...]
@@ -113,7 +113,7 @@ class Problem:
 
     @contextmanager
     def computing(self) -> Iterator[None]:
-        """Return a context in which deterministic jobs use one thread, and integrators raise PathreplayError."""
+        """Return a context for integrators, whose errors become PathreplayError. Deterministic jobs use one thread."""
         config = self.config
         names = "' or '".join(plugin.type for plugin in (config.integrator, config.baseline) if plugin is not None)
         with one_thread(config.deterministic), errors_as(f"Integrator '{names}' cannot do this job"):
@@ -135,7 +135,7 @@ class Problem:
         return (self,)
 
     def home(self, view: View) -> tuple[Problem, View]:
-        """Return the problem with the scene of a view, and the view in that problem."""
+        """Return the single-scene problem that renders a view, and the view as this problem contains it."""
         return self, view
 
     def made(self) -> tuple[Pose | Derived, ...]:
@@ -149,7 +149,7 @@ class Problem:
 
 def variables_of(problem: Problem, values: Arrays) -> dict[str, dr.ArrayBase]:
     """Convert the decoded values of the variables to evaluated Dr.Jit arrays that own their memory."""
-    # Copy by a product. NumPy's memory has varying alignments, which would force frozen functions to record again.
+    # The product copies values to aligned memory. NumPy's varying alignments would make frozen functions record again.
     one = dr.opaque(mi.Float, 1)
     variables = {v.key: v.held(values[v.key]) * one for v in problem.variables}
     dr.eval(variables)
@@ -258,7 +258,7 @@ def build_problem(
     baseline = None if config.baseline is None else _gradient_integrator(config.baseline)
     if baseline is not None:
         keys_of(params, config.parameters, config.derived, baseline)
-        _edges(params, keys, baseline)  # only suppresses the baseline's own note, because one note is enough
+        _edges(params, keys, baseline)  # suppress the baseline's note: one note is enough
     judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     # Cheap checks come before the rendering of targets.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
@@ -296,7 +296,7 @@ def build_problem(
     variables = tuple(_kept(disk, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in unsolved_poses)
     derived = tuple(replace(entry, truth=truth.get(entry.key)) for entry in derived)
-    # Traverse again, because SceneParameters from which values were read expect all of their keys at the next update().
+    # Traverse again: update() would require all keys that were read from the old `params`, and some are removed here.
     params = traversed(scene)
     parameters.keep_only(params, keys)
     digest = fingerprint(used.values()) if used else None

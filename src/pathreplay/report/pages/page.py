@@ -23,7 +23,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Still:
-    """One frame of a film: an image after a number of iterations."""
+    """One frame of a time-lapse film: an image after a number of iterations."""
 
     iteration: int
     src: str
@@ -155,6 +155,6 @@ class Page:
 
 
 def thinned(count: int, most: int = MOST_POINTS) -> list[int]:
-    """Return the indices at which a sequence is drawn: all, or about ``most`` evenly spaced indices and the last."""
+    """Return the indices of the points to draw: all, or about ``most`` evenly spaced ones and the last."""
     step = -(-count // most) or 1
     return [*range(0, count - 1, step), count - 1] if count else []

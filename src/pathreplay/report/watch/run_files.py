@@ -18,7 +18,7 @@ from pathreplay.report.pages.page import Page
 from pathreplay.runs.folder_lock import LOCK
 
 REPORT = "report.html"
-# Limit of a file, which is far larger than any of these files.
+# Maximum size of a file that is read, in bytes. The files of a run are far smaller.
 MOST_BYTES = 256 * 2**20
 PICTURES = {".png": "image/png", ".webp": "image/webp"}
 
@@ -57,7 +57,7 @@ def picture(run: Path, name: str) -> tuple[str, bytes] | None:
 
 
 def report(run: Path) -> bytes | None:
-    """Return the report, if the run has ended with one. The report is then newer than the live page."""
+    """Return the report; None if there is none, or if the live page is newer because the run was resumed."""
     with contextlib.suppress(OSError):
         written = (run / REPORT).stat().st_mtime_ns
         with contextlib.suppress(FileNotFoundError):
@@ -81,7 +81,7 @@ def page(run: Path) -> Page:
 
 
 def holder(run: Path) -> str | None:
-    """Return the process of the run, which is written in its lock file; None if the process has ended.
+    """Return the process that the run's lock file names; None if this process has ended.
 
     Processes on other machines cannot be checked, and count as running.
     """

@@ -161,7 +161,7 @@ class Handler(BaseHTTPRequestHandler):
         return False
 
     def _place(self) -> str | None:
-        """Return the requested path after the token. Answer a request that is refused, and return None."""
+        """Return the requested path after the token. If the request must be refused, answer it and return None."""
         if not self.server.knows(self.headers.get("Host", "")):
             self._answer(403, "text/plain", b"unknown host name\n")
             return None
@@ -174,7 +174,7 @@ class Handler(BaseHTTPRequestHandler):
         if not secrets.compare_digest(token.encode("utf-8", "replace"), self.server.token.encode()):
             self._answer(403, "text/plain", b"use the full address that pathreplay watch printed\n")
             return None
-        if not slash:  # the browser would not resolve the page's relative addresses correctly
+        if not slash:  # the browser would resolve the page's relative addresses wrongly
             self._answer(404, "text/plain", b"the address must end with a /\n")
             return None
         return place

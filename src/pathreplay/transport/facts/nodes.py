@@ -74,7 +74,7 @@ def with_gradients(root: mi.Object, *names: str) -> list[Any]:
         for name, value, cpptype in values:
             if not names or any(f"{prefix}{name}.".startswith(f"{n}.") for n in names):
                 value = value if cpptype is None else mi.get_property(value, cpptype, node)
-                if value is not None:  # None for ``sigma_a`` of hair with ``eumelanin``
+                if value is not None:  # hair with ``eumelanin`` has no ``sigma_a``
                     parameters.append(value)
         for name, child in children:
             if child not in seen:

@@ -1,7 +1,7 @@
 """Textures with discontinuities: checkerboards, bitmaps with nearest-neighbour lookup, face attributes of meshes.
 
-Boundary terms do not cover these discontinuities. Where such a texture exists, smooth continuations must not slide over
-static surfaces.
+Boundary terms do not cover these discontinuities. If such a texture exists, film positions must not follow moving
+surfaces, because static textures would then move relative to the film positions.
 """
 
 from __future__ import annotations

@@ -22,7 +22,8 @@ def mesh_smoothing_groups(mesh: mi.Mesh) -> np.ndarray:
     if "faces" not in params:
         return np.zeros(mesh.face_count(), int)
     faces, positions = (np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions"))
-    # Emission is continuous across seams. Segments that detect a seam would be wasted, and fewer would detect outlines.
+    # Seams of emitters are not edges, because emission is continuous across a seam. Boundary segments that detect such
+    # seams would be wasted, and fewer segments would detect outlines.
     return smoothing_groups(faces, positions, 0 if mesh.is_emitter() else WELD)
 
 
@@ -49,10 +50,10 @@ def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WEL
 
 
 def _places(positions: np.ndarray, vertices: np.ndarray, weld: float) -> np.ndarray:
-    """Return the index of the position of each vertex, which is equal for vertices that coincide up to rounding.
+    """Return an index for the position of each vertex; vertices that coincide up to rounding have equal indices.
 
-    Modelling programs compute both ends of a seam separately, for example as sin 0 and sin 2π. These differ in the last
-    bits.
+    Modelling programs compute both ends of a seam separately, for example as sin 0 and sin 2π. The two results differ
+    in the last bits.
     """
     ends, at = np.unique(vertices, return_inverse=True)
     if not len(ends):

@@ -24,16 +24,16 @@ ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
-# BSDFs that have no narrow lobe, except in nested BSDFs.
+# BSDFs that have no narrow lobe of their own. BSDFs nested in them may have one.
 DULL = FRAMES | {MASK, "SmoothDiffuse"}
 INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
-"""Entries of `Tables.groups_at` for shapes whose only edges are outlines, and for flat-shaded meshes."""
+"""Entries of `Tables.groups_at`: WHOLE for shapes whose only edges are outlines, FACETS for flat-shaded meshes."""
 COARSE = 1.0
 """Mean angle in degrees between triangles and shading normals above which a mesh is coarse."""
 
 MOST_RUNS = 4096
-"""Largest number of runs of equal values that `_array` writes, one by one, while `dr.freeze` records."""
+"""Largest number of runs of equal values in an array that `_array` creates while `dr.freeze` records."""
 
 T = TypeVar("T")
 V = TypeVar("V")
@@ -44,14 +44,14 @@ A = TypeVar("A", bound="dr.ArrayBase")
 class Tables:
     """Facts about BSDFs and shapes by registry index, as arrays for lookup in kernels.
 
-    A frozen function receives the tables as input or from the integrator. Otherwise they are created while `dr.freeze`
-    records (see `_array`).
+    A frozen function receives the tables as input or from the integrator. If neither has tables, they are created while
+    `dr.freeze` records (see `_array`).
     """
 
-    attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: no BSDF)
-    blend_lengths: mi.Float  # `velocity.blend_length` by shape
+    attachable: mi.Bool | None  # by BSDF: its smooth lobes may be sampled attached (None: for no BSDF)
+    blend_lengths: mi.Float  # by shape: `velocity.blend_length`
     groups_at: mi.UInt32  # by shape: offset of its triangles in `groups`, or `WHOLE` or `FACETS`
-    groups: mi.UInt32  # concatenated `smoothing_groups` of the meshes with such an offset; entry 0 is unused
+    groups: mi.UInt32  # concatenated `smoothing_groups` of the meshes with an offset; entry 0 is unused
     emitter_bounds: mi.Float  # bounding spheres of mesh emitters: see `emitter_bounds`
 
 
@@ -78,10 +78,10 @@ class Traits:
     veils: bool  # some surface may scatter part of the light and pass the rest unscattered
     masks_mirrors: bool  # some mask covers delta lobes
     narrow: bool  # some surface may have a narrow smooth lobe
-    glossy: bool  # narrow, and the scene has no checkerboard, over whose seams such a lobe would slide
+    glossy: bool  # `narrow`, and no checkerboard exists (its seams are not covered by boundary terms)
     outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
     tables: Tables = None  # type: ignore[assignment]  # for the current pass, like all fields below
-    # Whether these have gradients:
+    # Whether any of these has gradients:
     lights_deform: bool = False  # vertex positions of an emissive mesh
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
@@ -129,7 +129,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
 def tables_of(
     attachables: Iterable[mi.BSDF], shapes: list[mi.Shape], emitters: list[mi.Emitter], edges: bool = True
 ) -> Tables:
-    """Create the tables of a scene in its present state; without ``edges``, omit the long smoothing groups."""
+    """Create the tables of a scene in its present state. Without ``edges``, omit the smoothing groups (long arrays)."""
     attachable = _by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)
     return Tables(
         _array(mi.Bool, attachable) if attachables else None,
@@ -221,7 +221,7 @@ def _mesh_emitters(shapes: list[mi.Shape]) -> list[mi.Mesh]:
 
 
 def _bounding_sphere(mesh: mi.Mesh) -> np.ndarray:
-    """Return a bounding sphere around the box centre; radius 0 for a rectangle, whose vertices are not accessible."""
+    """Return centre and radius of a bounding sphere; radius 0 for a rectangle, whose vertices are not accessible."""
     params = mi.traverse(mesh)
     if "vertex_positions" not in params:
         return np.zeros(4)
@@ -261,9 +261,9 @@ def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
-    """Return whether no surface point sees an edge: the scene has a single shape, and no edge of it is visible from it.
+    """Return whether no surface point sees an edge: the only shape in the scene does not see an edge of itself.
 
-    A flat shape does not see itself at all. A sphere sees itself from the inside, where a texture would have a seam.
+    A flat shape does not see itself. The inside of a sphere sees itself, but no edge, unless a texture has a seam.
     """
     if len(shapes) != 1 or shapes[0].is_emitter():
         return False

@@ -4,10 +4,11 @@ Tentative collisions are sampled from a majorant, and each is either real or nul
 collision, or at the surface that bounds the medium. The sampling is not differentiated. Later passes differentiate the
 integrand, which is transmittance times scattering coefficient, at the sampled distance:
 
-    d log T = -∫ dσ_t ds,  estimated at evenly spaced points y of the flight:  -(t - a) · mean of dσ_t(y).
+    d log T = -∫ dσ_t ds,  estimated as  -(t - a) · mean of dσ_t(y),
 
-This estimator contains no division by a value that may be zero. It is therefore also correct where null collisions are
-never sampled, for example in a constant grid.
+where the flight extends from distance a to t, and the points y on the flight are evenly spaced. This estimator contains
+no division by a value that may be zero. It is therefore also correct where null collisions are never sampled, for
+example in a constant grid.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ POINTS = 4
 def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
     """Return 1 / (p + c (1 - p)) for probability p of a real collision and relative weight c of null collisions.
 
-    The derivative of in-scattering, dσ_s L_s, is also needed where σ_s is zero and real collisions cannot occur. Real
-    collisions therefore estimate only the fraction p / (p + c (1 - p)) of this derivative, and null collisions estimate
-    the rest. The in-scattered radiance L_s is estimated at each real collision, but at only one null collision per
-    path. All estimates have equal weight if c is the inverse of the number of null collisions.
+    The derivative of in-scattering is dσ_s L_s, with L_s the in-scattered radiance. It may be nonzero where σ_s is zero
+    and real collisions cannot occur. Real collisions therefore estimate only the fraction p / (p + c (1 - p)) of this
+    derivative, and null collisions estimate the rest. L_s is estimated at each real collision, but at only one null
+    collision per path. All estimates have equal weight if c is the inverse of the number of null collisions.
     """
     return dr.rcp(p + c * (1 - p))
 
@@ -52,7 +53,7 @@ def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, acti
     a, b = span(medium, ray, reach, flying)
     flying &= a < b
     σ_max = majorant(medium, ray, flying)
-    if dr.hint(trace.branch, mode="scalar"):  # null collisions are needed also where the medium is empty
+    if dr.hint(trace.branch, mode="scalar"):  # null branching needs null collisions in empty media, too
         σ_max = dr.maximum(σ_max, dr.select(dr.isfinite(b), dr.rcp(b - a), 0))
 
     t = mi.Float(a)
@@ -124,7 +125,7 @@ def _tentative(
     σ: mi.Float,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
-    """Return the distance from ``t`` to the next tentative collision, and the majorant there (``σ`` outside grids)."""
+    """Return the distance from ``t`` to the next tentative collision, and the majorant there: ``σ`` except in grids."""
     step = dr.select(σ > 0, -dr.log(1 - u) * dr.rcp(σ), dr.inf)
     for grid in trace.media.grids:
         mine = active & is_grid(grid, medium)
@@ -150,7 +151,7 @@ class Flown:
 
     mei: mi.MediumInteraction3f  # the interaction at the collision
     w: mi.Spectrum  # weight of radiance from the flight's end: W, times σ_s/density at a collision; differentiable
-    e: mi.Spectrum  # emission along the flight, and a control variate with value zero and a derivative of mean zero
+    e: mi.Spectrum  # emission along the flight, plus a control variate: its value is zero, its derivative has mean zero
 
 
 def fly_again(
@@ -160,13 +161,16 @@ def fly_again(
 
     ``reach`` is the distance to the surface, or infinity if there is none. The position of a collision relative to the
     two ends of the medium on its ray is constant. The collision thus moves with the ray and with the surface, and no
-    derivative is lost at the end of the flight. Let b be any function of position and direction
-    (`TraceConfig.baseline`). The control variate
+    derivative is lost at the end of the flight.
 
-        (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the second term only at a collision x)
+    Let a and t be the ends of the flight, y points on the flight, x the collision, and b any function of position and
+    direction (`TraceConfig.baseline`). The control variate
 
-    is the score of the sampling density times b, and has mean zero. Without this term, the variance is high where the
-    radiance is large and its derivative with respect to the medium is small.
+        (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the second term only if there is a collision)
+
+    is, up to sign, the score of the sampling density with both terms multiplied by b. Its mean is zero. Without the
+    control variate, the variance is high where the radiance is large and its derivative with respect to the medium is
+    small.
     """
     medium, ray = at.medium, at.ray
     in_medium = active & (medium != None)  # noqa: E711
@@ -184,7 +188,7 @@ def fly_again(
 
     σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
     σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
-    if trace.branch:  # null collisions estimate the rest of the derivative, for a fixed position
+    if trace.branch:  # remove the part of the derivative (at a fixed position) that null collisions estimate
         assert trace.branching is not None
         rest = 1 - flight.p * branch_weight(flight.p, trace.branching)
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
@@ -226,6 +230,6 @@ def fly_again(
 def _guess(
     trace: TraceConfig, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool
 ) -> mi.Spectrum:
-    """Evaluate the baseline, or zero where it would cause bias: for σ_t = 0, if no null collision is kept."""
+    """Evaluate the baseline. Without null branching, return zero where σ_t = 0, to avoid bias."""
     b = trace.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
     return b if trace.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

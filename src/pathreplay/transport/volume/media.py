@@ -88,9 +88,10 @@ def wants_branch(media: Sequence[mi.Medium]) -> bool:
 
 
 def _misses(medium: mi.Medium) -> bool:
-    """Return whether extinction has gradients, and is not known to be nonzero everywhere.
+    """Return whether extinction has gradients and may be zero somewhere.
 
-    Only constant extinction is inspected, and no values are known while `dr.freeze` records.
+    Extinction may be zero unless it is constant and its value is known to be nonzero. While `dr.freeze` records, no
+    values are known.
     """
     moving = with_gradients(medium, "sigma_t", "scale")
     known = medium.is_homogeneous() and not dr.flag(dr.JitFlag.FreezingScope)

@@ -144,7 +144,7 @@ def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool
 
 
 def _boundary(trace: TraceConfig, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool) -> mi.Float:
-    """Return the distance along ``ray`` of the surface next to y, towards the end (sign 1) or the origin (sign -1).
+    """Return the distance along ``ray`` of the first surface behind y (sign 1) or the last surface before y (sign -1).
 
     Without such a surface, return the distance of the ray's end (sign 1) or 0 (sign -1). Differentiable in the ray and
     in the surface.
@@ -153,7 +153,7 @@ def _boundary(trace: TraceConfig, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, s
     probe.maxt = still.maxt - y if sign > 0 else y
     hit = meet(trace, probe, active)
     met = active & hit.is_valid()
-    # The attached ray also starts at y, because Mitsuba computes the interaction with a sphere at the ray's first hit.
+    # The attached ray also starts at y: on a sphere, Mitsuba computes the interaction at the first hit of this ray.
     probe.o, probe.d = ray.o + y * ray.d, sign * ray.d
     si = hit.compute_surface_interaction(probe, mi.RayFlags.All, met)
     return dr.select(met, dr.replace_grad(y + sign * hit.t, y + sign * si.t), ray.maxt if sign > 0 else 0)
