@@ -117,6 +117,7 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
     },
     "scene": [{"scene": "pairs.xml"}],
     "iterations": [{"iterations": 2}],
+    "debias": [{"debias": True, "loss": "log"}, {"debias": True, "loss": "ssim"}],
     "eval_spp": [{"eval_spp": 3}],
     "spp": [{"spp": 8}, {"spp": "auto"}],
     "integrator": [

@@ -50,6 +50,7 @@ class Stream(IntEnum):
     FLOW_MEAN = 0x11  # paths that estimate the mean radiance for the film flow
     # Hashed with the seed of an image.
     SECOND_IMAGE = 0x2B5AD2C7  # a second, independent image of one view
+    SECOND_HALF = 0x5E1C93A7  # the second half of the samples of one view
 
     def of(self, seed: mi.UInt32) -> mi.UInt32:
         """Derive the seed or key of this stream from a shared seed or key."""

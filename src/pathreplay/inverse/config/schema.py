@@ -30,6 +30,8 @@ from pathreplay.types import Json
 
 PIXELWISE = ("l2", "relative-l2")
 """Losses that support pixel batches: the names of the losses in `pixelwise.QUADRATIC`."""
+CORNERED = ("l1", "relative-l1", "smape")
+"""Losses whose derivative jumps where image and target are equal."""
 
 # Streams of random seeds: iterations, targets and rendered images never share a seed.
 ITERATION, TARGET, PICTURE, JUDGEMENT, BATCH = 0, 1, 2, 3, 4
@@ -66,6 +68,8 @@ class Config(Table):
     """Target images."""
     loss: str = "l2"
     """Name of a loss, or module:function."""
+    debias: Switch = False
+    """Evaluate a smooth loss at two halves of the samples, too, and remove the bias due to noise to first order."""
     iterations: Count = 200
     """Number of iterations."""
     spp: Spp = 16
@@ -255,6 +259,24 @@ class Config(Table):
             raise ValueError(
                 "exposure: loss = 'scale-invariant' already fits a factor to each view; remove 'exposure', or use "
                 "another loss"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _extrapolated(self) -> Config:
+        if not self.debias:
+            return self
+        if self.loss in PIXELWISE:
+            raise ValueError(f"debias: the gradient of loss = '{self.loss}' has no bias; remove 'debias'")
+        if self.loss in CORNERED:
+            raise ValueError(
+                f"debias: loss = '{self.loss}' is not smooth where image and target are equal, so that extrapolation "
+                "does not remove its bias; remove 'debias', or use a smooth loss such as 'log'"
+            )
+        numbers = [self.spp, self.adaptive_spp.min] + [stage.spp for stage in self.stages or []]
+        if any(isinstance(spp, int) and spp < 2 * self.parts for spp in numbers):
+            raise ValueError(
+                f"debias: the loss is evaluated at two halves of the samples; set spp to {2 * self.parts} or more"
             )
         return self
 

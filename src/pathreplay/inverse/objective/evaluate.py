@@ -272,7 +272,7 @@ class Evaluator:
         # Seeds are inputs of recorded passes. Traced passes use plain integers, which need not be read back.
         number = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         request = RenderRequest(sensor, number, spp, batch)
-        loss = ViewLoss(problem.loss, about.share / len(problem.trained()), self._sweeps[which])
+        loss = ViewLoss(problem.loss, about.share / len(problem.trained()), self._sweeps[which], problem.debias)
         problem.disk.rest()
         with plain_errors():
             step = self._recordings[spp].differentiate if records else differentiate

@@ -11,11 +11,14 @@ import gc
 from collections import Counter
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import StatefulIntegrator
@@ -68,6 +71,8 @@ class ViewLoss:
     share: float
     swept: bool
     """Whether image and gradient come from one pixel sweep, which requires a quadratic loss."""
+    debias: bool = False
+    """Whether the bias due to noise is removed to first order: see `_extrapolated`."""
 
 
 @dataclass(frozen=True)
@@ -168,20 +173,47 @@ def _differentiate(
         image, state = integrator.pixel_pass(view, wanted, None if batch is None else batch.pixels, state)
         value = target.compared(loss.loss, image) * share
     else:
-        image = integrator.image_pass(view, state)
+        views = _halves(view) if loss.debias else [view]
+        images = [integrator.image_pass(each, state) for each in views]
         if dr.grad_enabled(dict(params)):
-            dr.enable_grad(image)
-        value = target.compared(loss.loss, image) * share
+            dr.enable_grad(images)
+        value, image = _extrapolated(loss.loss, target, images, [each.spp / view.spp for each in views])
+        value *= share
         if dr.grad_enabled(value):
             dr.backward(value)
             apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # the seed that `mi.render` would use
-            state = integrator.gradient_pass(apart, dr.grad(image), state)
+            state = integrator.gradient_pass(apart, reduce(add, map(dr.grad, images)), state)
     by_factor = None
     if factor is not None:
         other = mi.sample_tea_32(mi.UInt32(view.seed), mi.UInt32(int(Stream.SECOND_IMAGE)))[0]
         again = integrator.image_pass(replace(view, seed=other), state)
         by_factor = derivative(loss.loss, image, again, factor, target.target, target.weight) * share
     return ViewResult(dr.detach(value), state, by_factor)
+
+
+def _halves(view: Pass) -> list[Pass]:
+    """Split the samples of a pass into two passes with separate seeds."""
+    first, second = (view.spp + 1) // 2, view.spp // 2
+    other = mi.sample_tea_32(mi.UInt32(view.seed), mi.UInt32(int(Stream.SECOND_HALF)))[0]
+    return [replace(view, spp=first), replace(view, seed=other, spp=second)]
+
+
+def _extrapolated(
+    loss: Loss, target: ViewTarget, images: list[mi.TensorXf], shares: list[float]
+) -> tuple[mi.Float, mi.TensorXf]:
+    """Return the loss of the mean image, extrapolated from the losses of independent ``images``; and the mean image.
+
+    The bias of a smooth loss f at an image of N samples is c / N + O(1 / N²). Let the images have the ``shares`` s_i of
+    the samples. In 2 f(Σ s_i I_i) - Σ s_i f(I_i), the terms c / N of two images cancel (jackknife). All images have the
+    same expectation, so the adjoint of this expectation is the sum of the adjoints of the images.
+    """
+    if len(images) == 1:
+        return target.compared(loss, images[0]), images[0]
+    mean = reduce(add, [share * image for share, image in zip(shares, images, strict=True)])
+    value = 2 * target.compared(loss, mean)
+    for share, image in zip(shares, images, strict=True):
+        value -= share * target.compared(loss, image)
+    return value, dr.detach(mean)
 
 
 def _times(tensor: mi.TensorXf, factor: mi.TensorXf | None) -> mi.TensorXf:
