@@ -187,7 +187,7 @@ def options_of(optimizer: object) -> tuple[Json | None, object]:
     if hasattr(optimizer, "step"):
         return None, optimizer
     if callable(optimizer):
-        return {"type": "l-bfgs-b"}, optimizer  # jobs treat every function like this type
+        return {"type": "l-bfgs-b"}, optimizer  # a job runs any such function with the settings of L-BFGS-B
     raise PathreplayError(
         f"optimizer: {type(optimizer).__name__} has no step(); give a name such as 'adam', an optimizer of "
         "mitsuba.ad, an object with step(values, gradients, learning_rates, loss), or a function like "
