@@ -173,10 +173,10 @@ def _rated(problem: Problem) -> set[str]:
 
 
 def options_of(optimizer: object) -> tuple[Json | None, object]:
-    """Split the argument ``optimizer`` of `minimize` into options of a job and an object of the user.
+    """Split the argument ``optimizer`` of `minimize` into options of a job and an object of the user, or None for each.
 
-    The object is None for a name, a mapping or None. The options are None for an optimizer object or None. A function
-    gets the options of ``l-bfgs-b``. Raises PathreplayError for any other argument.
+    A name or a mapping has options alone, and an optimizer object is an object alone. A function is an object with the
+    options of ``l-bfgs-b``. Raises PathreplayError for any other argument.
     """
     if optimizer is None or isinstance(optimizer, str):
         return None if optimizer is None else {"type": optimizer}, None

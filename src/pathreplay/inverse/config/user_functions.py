@@ -96,8 +96,8 @@ class Modules:
     def _loaded(self, name: str) -> ModuleType:
         """Execute a module of the folder ``base``, or import an installed one.
 
-        A module of the folder is executed even if a module of the same name is already loaded from elsewhere. During the
-        execution, imports search the folder ``base`` first, as if Python had been started there.
+        A module of the folder is executed even if a module of the same name is already loaded, e.g. from another
+        folder. During the execution, imports search ``base`` first, as if Python had been started there.
         """
         path = None if self._base is None else self._base / f"{name}.py"
         if self._base is None or path is None or not path.is_file():
