@@ -22,7 +22,7 @@ from pathreplay.library.problem import Problem, run_settings
 
 
 class _Task:
-    """Settings, kernels and optimiser that all states of an optimisation share. The optimiser's state is ``at``."""
+    """Settings, kernels and optimiser that all states of an optimisation share. The optimiser is in state ``at``."""
 
     def __init__(self, changes: Mapping[str, object]) -> None:
         self._changes = changes

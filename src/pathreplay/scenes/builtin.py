@@ -327,7 +327,7 @@ def _cumulus(size: int) -> np.ndarray:
         (0.12, 0.42, -0.14, 0.32), (-0.14, -0.15, 0.52, 0.34), (0.3, -0.2, -0.5, 0.3),
     ):  # fmt: skip
         shape += np.exp(-(np.square(x - cx) + np.square(y - cy) + np.square(z - cz)) / radius**2)
-    shape *= 1 / (1 + np.exp(-(y + 0.45) / 0.06))  # the flat base
+    shape *= 1 / (1 + np.exp(-(y + 0.45) / 0.06))  # cut off the blobs at a flat base
     random = np.random.default_rng(5)  # any fixed pattern will do
     k = random.normal(size=(12, 3))
     k *= (2 * np.pi / random.uniform(0.5, 1.2, (12, 1))) / np.linalg.norm(k, axis=1, keepdims=True)
