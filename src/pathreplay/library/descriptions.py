@@ -105,7 +105,7 @@ def require_kinds(wanted: Mapping[str, Parameter | None], views: Sequence[View],
 
 
 def by_key(parameters: Mapping[str, Parameter | None] | Sequence[str] | str) -> dict[str, Parameter | None]:
-    """Return the options of parameters by key or glob; a key that is given without options has None."""
+    """Return the options of parameters, by key or glob. The value is None for a key without options."""
     if isinstance(parameters, Mapping):
         return dict(parameters)
     return dict.fromkeys([parameters] if isinstance(parameters, str) else parameters)

@@ -68,7 +68,7 @@ class FolderRun:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Save a checkpoint if an error or closing the generator ends the iterations in this block early.
+        """Save a checkpoint if the iterations in this block end early, by an error or because the generator is closed.
 
         A new folder is removed if the first iteration fails. A resumed folder is never removed.
         """

@@ -200,7 +200,7 @@ def _folder_run(
 def _observers(
     bar: Progress | NotebookPanel, built: inner.Problem, run: Run, stop: Stop, kept: FolderRun | None
 ) -> list[Callable[[Event], None]]:
-    """Return the observers besides the progress display: the run folder, or images for a notebook without one."""
+    """Return the observers other than the progress display: the run folder or, without it, images for a notebook."""
     if kept is not None:
         if isinstance(bar, NotebookPanel):
             bar.follow(kept.previews.pictures, str(kept.folder.name))

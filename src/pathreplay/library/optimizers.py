@@ -36,7 +36,7 @@ class Stepper(Protocol):
 class OfMitsuba:
     """An optimiser of `mitsuba.ad` or `drjit.opt`.
 
-    Variables in ``own`` use the learning rates of the problem, and all others the learning rate of the optimiser.
+    Variables in ``own`` use the learning rates of the problem. Other variables use that of the optimiser.
     """
 
     finished = ""
@@ -110,7 +110,7 @@ class OfUser:
     finished = ""
 
     def __init__(self, stepper: Stepper, values: Arrays) -> None:
-        self._stepper: Any = stepper  # Any, because state_dict() and load_state_dict() are optional
+        self._stepper: Any = stepper  # typed Any, because state_dict() and load_state_dict() are optional
         self._steps = dict.fromkeys(values, 0)
 
     def step(
@@ -175,8 +175,8 @@ def _rated(problem: Problem) -> set[str]:
 def options_of(optimizer: object) -> tuple[Json | None, object]:
     """Split the argument ``optimizer`` of `minimize` into options of a job and an object of the user.
 
-    The object is None for a name, a mapping or None. The options are None for an optimizer object or None. A function
-    gets the options of ``l-bfgs-b``. Raises PathreplayError for any other argument.
+    The object is None for a name or a mapping. The options are None for an optimizer object. Both are None if
+    ``optimizer`` is None. A function gets the options of ``l-bfgs-b``. Raises PathreplayError for any other argument.
     """
     if optimizer is None or isinstance(optimizer, str):
         return None if optimizer is None else {"type": optimizer}, None
@@ -187,7 +187,7 @@ def options_of(optimizer: object) -> tuple[Json | None, object]:
     if hasattr(optimizer, "step"):
         return None, optimizer
     if callable(optimizer):
-        return {"type": "l-bfgs-b"}, optimizer  # jobs treat every function like this type
+        return {"type": "l-bfgs-b"}, optimizer  # a job runs any such function with the settings of L-BFGS-B
     raise PathreplayError(
         f"optimizer: {type(optimizer).__name__} has no step(); give a name such as 'adam', an optimizer of "
         "mitsuba.ad, an object with step(values, gradients, learning_rates, loss), or a function like "

@@ -284,14 +284,14 @@ def _loaded(scene: object, job: Json, base: Path) -> tuple[mi.Scene, tuple[str, 
 
 
 def _moved(job: Json, scene: mi.Scene, views: Sequence[View] | None) -> Targets | None:
-    """Change a job so that its scene is in memory. Without ``views``, return None.
+    """Replace the scene in the tables of a job by a reference to a scene in memory.
 
-    Otherwise the views replace the job's sensors and targets, and the new targets are returned.
+    If ``views`` are given, they replace the sensors and targets of the job. Returns their targets, or None.
     """
     said, job["scene"] = job.get("scene"), IN_MEMORY
     if views is None:
         if "images" not in job.get("target", {}) and "capture" not in job:
-            job["target"] = {"scene": said, **job.get("target", {})}  # targets are still rendered from the file's scene
+            job["target"] = {"scene": said, **job.get("target", {})}  # keep rendering the targets from the job's scene
         return None
     named = by_name(scene, views)
     job.pop("capture", None)

@@ -22,7 +22,7 @@ from pathreplay.library.problem import Problem, run_settings
 
 
 class _Task:
-    """Settings, kernels and one optimiser for all states. The optimiser's internal state is that of ``at``."""
+    """Settings, kernels and optimiser that all states of an optimisation share. The optimiser is in state ``at``."""
 
     def __init__(self, changes: Mapping[str, object]) -> None:
         self._changes = changes
@@ -46,7 +46,7 @@ class _Task:
         if self.optimiser is None or self.at is not state:
             self.optimiser = self.own or optimiser_of(built, state._next, built.config.optimizer)
             self.optimiser.restore(state._kept, latents(built.variables, state._next))
-        self.at = None  # until the step has succeeded, the optimiser fits no state
+        self.at = None  # the optimiser matches no State until the step has succeeded
         return self.optimiser
 
 

@@ -64,8 +64,9 @@ def _room(radius: float) -> SceneDict:
     """Describe an emissive sphere around the origin, with poles above and below and a smooth radiance texture.
 
     Because the texture is smooth, gradients point to the optimum from far away. Because the sphere has finite size, an
-    image also depends on the position of the camera. The radiance from direction d in colour channel c is 0.6 + 0.08
-    Σ_j cos(k_cj · d + φ_cj), with wavelengths of 30 to 90 degrees.
+    image also depends on the position of the camera. The radiance from direction d in colour channel c is
+    0.6 + 0.08 Σ_j cos(k_cj · d + φ_cj), with random phases φ_cj and random wave vectors k_cj (wavelengths 30 to 90
+    degrees).
     """
     v, u = _centres(64, 128)
     θ, φ = np.pi * v, 2 * np.pi * u
@@ -249,7 +250,7 @@ def shadows(resolution: int = 32, views: int = 4, ball_splits: int = 0) -> Scene
 
 
 def silhouette_in_mirror(resolution: int = 32) -> SceneDict:
-    """Describe the body of `silhouettes` beside a mirror: one camera sees the body, and its other side in the mirror.
+    """Describe the body of `silhouettes` beside a mirror. One camera sees the body and, in the mirror, its other side.
 
     The width of the image is twice its height. The rim of the mirror is invisible, because the mirror reflects the same
     white sky that surrounds it.
@@ -272,7 +273,8 @@ def _panel(place: mi.ScalarTransform4f, *colour: float) -> SceneDict:
 def flat_colours(resolution: int = 32) -> SceneDict:
     """Describe emissive panels of one colour each, at different distances before a black background.
 
-    An image shows nothing but edges. The camera (key ``camera.to_world``) looks at the panels from a distance of 3.
+    Each panel has uniform radiance, so small motions change an image only at edges. The camera (key
+    ``camera.to_world``) looks at the panels from a distance of 3.
     """
 
     def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> mi.ScalarTransform4f:
@@ -315,8 +317,8 @@ def _cumulus(size: int) -> np.ndarray:
     """Return the extinction of a cloud at the voxel centres of [-1, 1]³, as an array of shape (z, y, x, 1).
 
     The extinction is max(0, 8 b(y) Σ_i exp(-|x - c_i|² / r_i²) (0.75 + n(x)) - 1.5). The sum is over six Gaussian
-    blobs. The factor b cuts off the lower part of the blobs, so that the base is flat. The noise n is a sum of 12 plane
-    waves with wavelengths from 0.5 to 1.2.
+    blobs with centres c_i and radii r_i. The factor b cuts off the lower part of the blobs, so that the base is flat.
+    The noise n is a sum of 12 plane waves with wavelengths from 0.5 to 1.2.
     """
     z, y, x = (2 * centres - 1 for centres in _centres(size, size, size))
     shape = np.zeros_like(x)
@@ -325,7 +327,7 @@ def _cumulus(size: int) -> np.ndarray:
         (0.12, 0.42, -0.14, 0.32), (-0.14, -0.15, 0.52, 0.34), (0.3, -0.2, -0.5, 0.3),
     ):  # fmt: skip
         shape += np.exp(-(np.square(x - cx) + np.square(y - cy) + np.square(z - cz)) / radius**2)
-    shape *= 1 / (1 + np.exp(-(y + 0.45) / 0.06))  # the flat base
+    shape *= 1 / (1 + np.exp(-(y + 0.45) / 0.06))  # cut off the blobs at a flat base
     random = np.random.default_rng(5)  # any fixed pattern will do
     k = random.normal(size=(12, 3))
     k *= (2 * np.pi / random.uniform(0.5, 1.2, (12, 1))) / np.linalg.norm(k, axis=1, keepdims=True)

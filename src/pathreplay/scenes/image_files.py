@@ -50,8 +50,8 @@ class RadianceHead:
     axes: str
     """Order of the axes in the file: YX if scanlines are rows, XY if scanlines are columns."""
     signs: str
-    """Signs of both axes, in the same order. Y is negative for rows from top to bottom, X is positive from left to
-    right."""
+    """Signs of the axes, in the order of ``axes``. Y is negative for rows from top to bottom, X is positive for columns
+    from left to right."""
     counts: tuple[int, int]
     """Number of scanlines, and of pixels per scanline."""
     exposure: float

@@ -128,7 +128,7 @@ def load_scene_for(
 def load_scene_with_floats(
     spec: str | Path, wanted: Iterable[str], base: Path | None = None, /, **parameters: object
 ) -> mi.Scene:
-    """Load a scene like `load_scene`, with floating-point texels in 8-bit textures that match ``wanted`` (globs)."""
+    """Load a scene like `load_scene`, and convert 8-bit textures that match ``wanted`` (keys, globs) to floats."""
     scene = load_scene(spec, base, **parameters)
     if not (floats := coarse_pictures(traversed(scene), wanted)):
         return scene
@@ -138,7 +138,7 @@ def load_scene_with_floats(
 
 
 def coarse_pictures(params: mi.SceneParameters, wanted: Iterable[str]) -> tuple[str, ...]:
-    """Return the files of the 8-bit textures that match keys and globs ending in ``data``."""
+    """Return the image files of 8-bit textures that match ``wanted``: the keys and globs that end in ``data``."""
     owners = [params.properties[key][2] for key in _matching(params, wanted, "data")]
     matches = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
     return tuple(dict.fromkeys(match[1] for match in matches if match))

@@ -32,7 +32,7 @@ class _Element:
         return [kinds[0] for kinds in self.properties]
 
     def layout(self, form: str) -> np.dtype[np.void]:
-        """Return the NumPy type of an entry. Lists must have three items. Numbers from text files become float64."""
+        """Return the NumPy type of one vertex or face. Lists must have three items. Numbers in text are float64."""
         order = "<" if form == "binary_little_endian" else ">"
         fields: list[tuple[str, str] | tuple[str, str, int]] = []
         for i, (*kinds, _) in enumerate(self.properties):

@@ -61,9 +61,9 @@ def require_sound_tga(path: Path) -> None:
 def _filled(data: bytes, pixels: int, pixel: int) -> int:
     """Count the pixels in the packets of a file, until the count reaches ``pixels``.
 
-    The lower seven bits of the first byte of a packet are the number of pixels minus one. The pixels follow, of
-    ``pixel`` bytes each. If the highest bit of the first byte is set, a single pixel follows, which is repeated.
-    Truncated packets do not count.
+    The lower seven bits of the first byte of a packet are the number of pixels minus one. If the highest bit of this
+    byte is set, a single pixel follows, which is repeated. Otherwise, all pixels follow. Each pixel has ``pixel``
+    bytes. Truncated packets do not count.
     """
     at = filled = 0
     while filled < pixels and at < len(data):

@@ -33,12 +33,12 @@ _VOL_MAGIC = b"VOL\x03"
 _VOL_HEADER = struct.Struct("<4s5i6f")
 _FLOAT32 = 1
 
-# 4 GiB of float32. In a larger grid, the bounding box is probably wrong.
+# Largest number of voxels: 4 GiB of float32. The bounding box of a larger grid is probably wrong.
 _MOST_VOXELS = 2**30
-# NanoVDB voxels are read one by one, a million per second. This limit corresponds to half a minute.
+# Largest number of voxels of a NanoVDB grid. They are read one by one, a million per second: half a minute.
 _MOST_ASKED_FOR = 2**25
 
-# At a higher extinction, free paths are far shorter than the resolution of single precision.
+# Largest absolute value. At higher extinctions, free paths are far shorter than the resolution of single precision.
 _LARGEST = 1e12
 
 

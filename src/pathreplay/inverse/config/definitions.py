@@ -11,7 +11,7 @@ from pathreplay.inverse.config.parsing import from_toml
 T = TypeVar("T")
 
 DEEPEST = 16
-"""Maximum number of parts of a dotted key. The tables of a job are far less deep."""
+"""Maximum number of parts of a dotted key, far more than any real job needs."""
 _VALUES = (bool, int, float, str, list, dict)
 
 

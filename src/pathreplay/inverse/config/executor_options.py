@@ -1,4 +1,4 @@
-"""Executor of a job, which evaluates its views in this process or by Ray actors, and the options of Ray."""
+"""Executor of a job (evaluation of views in this process or by Ray actors), and the options of Ray."""
 
 from __future__ import annotations
 

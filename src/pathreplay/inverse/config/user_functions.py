@@ -96,8 +96,8 @@ class Modules:
     def _loaded(self, name: str) -> ModuleType:
         """Execute a module of the folder ``base``, or import an installed one.
 
-        A module of the folder is executed even if a module of the same name is loaded, e.g. from another folder. During
-        the execution, imports resolve to the folder first, as if Python had been started in it.
+        A module of the folder is executed even if a module of the same name is already loaded, e.g. from another
+        folder. During the execution, imports search ``base`` first, as if Python had been started there.
         """
         path = None if self._base is None else self._base / f"{name}.py"
         if self._base is None or path is None or not path.is_file():
@@ -125,7 +125,7 @@ class Modules:
 
 @contextmanager
 def _same_variant(who: str) -> Iterator[None]:
-    """Raise PathreplayError if the code in the context changes Mitsuba's variant, after restoring the variant.
+    """If the code in the context changes Mitsuba's variant, restore the variant and raise PathreplayError.
 
     The message begins with ``who``.
     """
@@ -157,7 +157,7 @@ def _no_numbers(value: object, depth: int = 0) -> str:
     if isinstance(value, (np.ndarray, np.generic)):
         return "" if value.dtype.kind in "biuf" else f"a NumPy array of {value.dtype}"
     transform = hasattr(value, "matrix") and type(value).__module__.startswith("mitsuba")
-    others = hasattr(value, "__dlpack__") or hasattr(value, "__cuda_array_interface__")  # e.g. PyTorch
+    others = hasattr(value, "__dlpack__") or hasattr(value, "__cuda_array_interface__")  # e.g. PyTorch tensors
     if isinstance(value, numbers.Real) or dr.is_array_v(value) or transform or others:
         return ""
     return "None" if value is None else f"the {type(value).__name__} {shown(value)}"

@@ -87,7 +87,7 @@ def fingerprint(shots: Iterable[Shot]) -> str:
 
 
 def _mask(photo: Photo, masks: Path) -> Path:
-    """Find the mask of a photo, named like the photo with '.png' appended, or with '.png' in place of the suffix."""
+    """Find the mask of a photo: the photo's file name with '.png' appended, or with '.png' in place of its suffix."""
     image = photo.image.name
     mask = next((p for n in (f"{image}.png", f"{photo.image.stem}.png") if not file_problem(p := masks / n)), None)
     if mask is None:

@@ -103,7 +103,7 @@ def rendered_targets(
 ) -> dict[str, Image]:
     """Render the targets of all views, each with its own seed. Raises PathreplayError if the scene lacks a sensor."""
     plugin = target.integrator
-    assert plugin is not None  # set by `completed`
+    assert plugin is not None  # `completed` fills in a missing integrator
     integrator = load_integrator(plugin.model_dump())
     if len(scene.sensors()) <= max(sensors.values()):
         raise PathreplayError(
@@ -268,7 +268,7 @@ def require_weights(targets: Targets, masked: set[str]) -> None:
 
 
 def by_view(what: str, files: list[str] | str, sensors: dict[str, int], base: Path) -> dict[str, str]:
-    """Assign files to views in order, after expanding patterns. Raises PathreplayError unless the numbers match."""
+    """Expand patterns and assign files to views in order. Raises PathreplayError unless each view has one file."""
     paths = list(matching([files] if isinstance(files, str) else files, base))
     if len(paths) != len(sensors):
         raise PathreplayError(

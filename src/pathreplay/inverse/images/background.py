@@ -48,7 +48,7 @@ def background(scene: mi.Scene, sensor: int) -> Image:
 
 
 def require_known(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Raise PathreplayError if a key belongs to the environment emitter, since fixed targets are composited over it."""
+    """Raise PathreplayError if the job recovers the environment, over which the targets are composited beforehand."""
     if (environment := scene.environment()) is None:
         return
     parts = {owner[2] for owner in mi.traverse(environment).properties.values()}

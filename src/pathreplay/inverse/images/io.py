@@ -133,7 +133,7 @@ def _radiance(file: BinaryIO, head: RadianceHead) -> tuple[mi.Bitmap, Callable[[
     file.seek(head.length)
     stream = mi.MemoryStream()
     stream.write(f"#?RADIANCE\nFORMAT=32-bit_rle_{kind}\n\n-Y {lines} +X {columns}\n".encode())
-    stream.write(file.read(8 * lines * (columns + 1)))  # twice the size of the worst run-length encoding
+    stream.write(file.read(8 * lines * (columns + 1)))  # no valid run-length encoding is longer
     stream.seek(0)
 
     def arranged(image: Image) -> Image:
@@ -184,9 +184,9 @@ def with_channels(image: Image, channels: int) -> Image | None:
 
 
 def over_black(image: Image, path: Path) -> Image:
-    """Multiply the colours of an image file by its alpha, and keep alpha. Rendered images are premultiplied, too.
+    """Premultiply the colours of an image from a file by alpha, as in rendered images.
 
-    EXR files already store premultiplied colours. All other formats store straight alpha.
+    EXR files already store premultiplied colours, and are returned unchanged. All other formats store straight alpha.
     """
     if image.shape[2] not in (2, 4) or path.suffix.lower() == ".exr":
         return image

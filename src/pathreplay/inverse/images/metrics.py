@@ -14,7 +14,7 @@ from pathreplay.inverse.images.io import Image, displayed
 SIGMA, CUT = 1.5, 5
 C1, C2 = 0.01**2, 0.03**2
 MOST_DB = 100.0
-"""Upper limit of the PSNR, reached by images that are equal to single precision."""
+"""Upper limit of the PSNR in decibels, reached by images that differ by rounding errors at most."""
 
 
 @dataclass(frozen=True)

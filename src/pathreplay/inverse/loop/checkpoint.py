@@ -31,13 +31,13 @@ class Entry:
 
     iteration: NonNegativeInt
     loss: FiniteFloat
-    """Loss before the step, without the penalty."""
+    """Loss before the step, without regularizers."""
     seconds: Annotated[FiniteFloat, Field(ge=0)]
-    """Wall-clock time of the iteration, without the computation of errors."""
+    """Wall-clock time of the iteration, without the time to compute ``errors`` and ``picture_error``."""
     gradient_norms: dict[str, float]
     """L2 norms of the gradients."""
     dropped: NonNegativeInt = 0
-    """Number of gradient entries of single views that were NaN or infinite and counted as zero."""
+    """Number of NaN or infinite gradient entries, summed over the views. They count as zero."""
     errors: dict[str, float] = field(default_factory=dict)
     """Errors after the step: RMS errors of variables with a known true value, and errors of poses (`PoseError.of`)."""
     picture_error: float | None = None
@@ -49,7 +49,7 @@ class Entry:
     noise_norms: dict[str, float] = field(default_factory=dict)
     """L2 norms of the noise of the gradients, if the job measures it (see `noise`)."""
     dropped_shares: dict[str, float] = field(default_factory=dict)
-    """Fraction of a variable's gradient entries, over all views, that were NaN or infinite and counted as zero."""
+    """Fraction of NaN or infinite entries in the gradients of each variable, over all views."""
     slopes: dict[str, list[float]] = field(default_factory=dict)
     """Sums of each gradient over parts of its variable (see `movement`)."""
     means: dict[str, list[float]] = field(default_factory=dict)

@@ -61,7 +61,7 @@ def require_seal(path: Path) -> None:
 
 
 def with_sums(files: Mapping[str, Content]) -> dict[str, Content]:
-    """Add the file `SUMS` to files by name. Its content is generated after the other files have been written."""
+    """Add the file `SUMS` to ``files`` (by name). Its content is generated after the other files are written."""
     sums: dict[str, _Sum] = {}
 
     def summed(name: str, content: Content) -> Iterator[Chunk]:

@@ -159,7 +159,7 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
 
 
 def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
-    """Yield the events of `iterate`. Steps run inside `Problem.computing`; the consumer of the events does not."""
+    """Yield the events of `iterate`. Steps run inside the context `Problem.computing`, unlike the caller's code."""
     events = iterate(problem, run, stop)
     while True:
         with problem.computing():

@@ -27,7 +27,8 @@ from pathreplay.inverse.problem.problem import Problem
 FEW = 4
 """Maximum number of entries of a variable that are perturbed one by one. Larger variables are scaled as a whole."""
 MOST_COLUMNS, MOST_PIXELS, MOST_ROWS = 16, 2**23, 2**20
-"""Maximum number of columns of J, of pixels in all views, and of rows of J. If J has more rows, every k-th is used."""
+"""Limits on the columns of J, the pixels of all views, and the rows of J. If J has k times as many rows or more, only
+every k-th row is used."""
 MOST_SAMPLES, FREE_SAMPLES, SHARE = 16, 2**22, 0.1
 """`MOST_SAMPLES` is the maximum number of samples per pixel. The total number of samples is limited to `FREE_SAMPLES`,
 or to the fraction `SHARE` of the run's samples if that is more."""

@@ -26,7 +26,7 @@ from pathreplay.inverse.losses.image_losses import lpips, scale_invariant, ssim
 Loss: TypeAlias = "Callable[..., mi.TensorXf]"
 """loss(image, target), on tensors of shape (height, width, channels); returns a tensor of that shape or a scalar."""
 
-# Radiance that bounds the denominators of relative losses: about 1 % of display white.
+# Floor (radiance) that is added to the denominators of relative losses: about 1 % of display white.
 RELATIVE_FLOOR = 1e-2
 
 
@@ -103,9 +103,10 @@ def mean_loss(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weight: mi.Te
 
 
 def find_loss(name: str, modules: Modules | None = None) -> Loss:
-    """Return a loss by its name, or import ``module:function`` through ``modules`` (default: installed modules).
+    """Return the loss of this name, or import a user function ``module:function``.
 
-    Raises PathreplayError if the import fails, or if the name is unknown; the message then suggests the nearest name.
+    ``modules`` finds and imports user functions; by default, only installed modules are searched. Raises
+    PathreplayError if the name is unknown or the import fails. For an unknown name, the message suggests the nearest.
     """
     if name in LOSSES:
         return LOSSES[name]

@@ -26,7 +26,7 @@ class Batch:
 
     @staticmethod
     def of(weight: Array | None, size: tuple[int, int], most: int, seed: int) -> Batch | None:
-        """Draw ``most`` random pixels of an image of ``size`` (height, width); None if the image has no more pixels."""
+        """Draw ``most`` random pixels of an image of ``size`` (height, width); None if it has at most ``most``."""
         height, width = size
         n = height * width
         if most >= n:

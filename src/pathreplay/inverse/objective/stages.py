@@ -101,7 +101,7 @@ def _moving(problem: Problem, stage: Stage) -> list[str]:
 
 
 def require_stages(problem: Problem) -> None:
-    """Raise PathreplayError unless films and integrators suit all stages, and some stage optimises each variable."""
+    """Raise PathreplayError unless films and integrators suit all stages and each variable is optimised in a stage."""
     config = problem.config
     for number, stage in enumerate(config.stages or []):
         part = _part(problem, number, stage)

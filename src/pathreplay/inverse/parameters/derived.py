@@ -2,8 +2,8 @@
 
     p = f(p₀, a, b, ...),      where p₀ is the value in the scene and a, b, ... are variables
 
-Examples are a mesh that bends by two numbers, one colour for three materials, a camera on a turntable, or a texture
-that a neural network predicts. The function is written in Dr.Jit, and derivatives propagate through it.
+Examples are a mesh whose bending depends on two numbers, one colour for three materials, a camera on a turntable, or
+a texture that a neural network predicts. The function is written in Dr.Jit, and derivatives propagate through it.
 """
 
 from __future__ import annotations

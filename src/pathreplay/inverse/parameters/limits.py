@@ -37,7 +37,7 @@ def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> 
     most = min(memory.available() // _A_VALUE, MOST_SAMPLES)
     if cells(wanted) <= most:
         return
-    # cells(n) >= n, so resolutions above `most` need not be searched.
+    # A resolution n has at least n cells, so resolutions above `most` need not be searched.
     fits = bisect.bisect_right(range(min(wanted, most + 1)), most, key=cells) - 1
     remedy = f"use a resolution up to {fits}" if fits > 0 else "free some memory"
     raise PathreplayError(

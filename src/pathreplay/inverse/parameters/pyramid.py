@@ -1,12 +1,12 @@
 """Laplacian pyramid of a grid: the optimiser steps the levels, and the grid is the sum of their interpolations.
 
-With interpolations U_j from level j to the resolution of the grid, the grid is
+Let u_j be the entries of level j, and U_j the interpolation from level j to the resolution of the grid. The grid is
 
     v = Σ_j U_j u_j,        so that        ∂/∂u_j = U_jᵀ ∂/∂v.
 
-An optimiser such as Adam normalises each entry by its own moments. In a pyramid, it moves low frequencies as fast as on
-a coarse grid, with the low gradient noise of that grid. Entries without a gradient of their own change along with their
-neighbours, through the coarse levels (Weier et al. 2025).
+An optimiser such as Adam normalises each entry by its own moments. On the levels of a pyramid, Adam changes low
+frequencies as fast as on a coarse grid, and with the low gradient noise of a coarse grid. Entries whose gradient is
+zero change along with their neighbours, through the coarse levels (Weier et al. 2025).
 
 A given v does not determine the levels. Before each step, v is assigned to the finest level, and all others are zero.
 The step depends on gradients only, and the levels are discarded after it.
@@ -72,7 +72,7 @@ class Pyramid:
         return level if self.inner is None else self.inner.values(level)
 
     def _resize(self, level: Array, shape: Shape, transposed: bool = False) -> Array:
-        """Interpolate a level to ``shape``, or apply the transpose of the interpolation from ``shape`` to it."""
+        """Interpolate ``level`` to ``shape``, or apply the transposed interpolation from ``shape`` to ``level``."""
         last = len(shape) - 2
         for axis, n in enumerate(shape[:-1]):
             m = level.shape[axis]
@@ -96,7 +96,7 @@ def _levels(shape: Shape) -> list[Shape]:
 
 @cache
 def _interpolation(m: int, n: int, wraps: bool) -> scipy.sparse.csr_array:
-    """Return the matrix (n x m) that interpolates m entries linearly between cell centres at n centres."""
+    """Return the n x m matrix of linear interpolation from the centres of m cells to the centres of n cells."""
     x = (np.arange(n) + 0.5) * (m / n) - 0.5
     left = np.floor(x).astype(int)
     weight = (x - left).astype(np.float32)

@@ -50,7 +50,7 @@ class Penalty:
 
 @dataclass(frozen=True)
 class TotalVariation:
-    """Total variation w · Σ mean(√(Δv² + r²) - r) of a grid.
+    """Total variation w · Σ mean(√(Δv² + r²) - r) of a grid, with weight w.
 
     The sum is over the spatial axes. The mean is over the differences Δv of all neighbours along an axis. r is `ROUND`.
     """
@@ -73,7 +73,7 @@ class TotalVariation:
 
 @dataclass(frozen=True)
 class Prior:
-    """Quadratic penalty w · mean (v - start)². For grids, ``start`` is resampled to the resolution of the values v."""
+    """Penalty w · mean (v - start)² with weight w. For grids, ``start`` is resampled to the resolution of values v."""
 
     weight: float
     start: Array
@@ -182,7 +182,7 @@ def laplacian(positions: ArrayLike, faces: ArrayLike) -> Callable[[mi.TensorXf],
 
 
 def _differentiable(term: Term, values: mi.TensorXf) -> mi.TensorXf:
-    """Evaluate a term as a tensor with its first derivative."""
+    """Evaluate a term as a Dr.Jit tensor that is differentiable once."""
     value, slope = term(np.array(dr.detach(values)))
     linear = dr.sum((values - dr.detach(values)) * mi.TensorXf(slope.astype(np.float32)), axis=None)
     return linear + value

@@ -216,7 +216,7 @@ def _coordinates(
 
 
 def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.integer]:
-    """Return the faces of the mesh with these vertex positions. Raises PathreplayError if there is no such mesh."""
+    """Return the faces of the mesh whose vertex positions are ``key``. Raises PathreplayError for any other key."""
     owner, _, name = key.rpartition(".")
     if name != "vertex_positions" or (faces := f"{owner}.faces") not in params:
         raise PathreplayError(f"Parameter '{key}' is not the vertex_positions of a mesh; remove '{option}'")
@@ -226,7 +226,7 @@ def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.inte
 def _penalty(
     params: mi.SceneParameters, key: str, entry: Parameter, start: Array, levels: Levels | None, modules: Modules
 ) -> Penalty | None:
-    """Make the regularizers of a parameter. Raises PathreplayError if one cannot be computed in every resolution."""
+    """Make the regularizers of a parameter. Raises PathreplayError if a regularizer fails in some resolution."""
     terms: list[Term] = []
     if entry.total_variation is not None:
         if start.ndim < 3:

@@ -118,7 +118,7 @@ class Problem:
 
     @contextmanager
     def computing(self) -> Iterator[None]:
-        """Return a context for integrators, whose errors become PathreplayError. Deterministic jobs use one thread."""
+        """Return a context that turns errors of integrators into PathreplayError. Deterministic jobs use one thread."""
         config = self.config
         names = "' or '".join(plugin.type for plugin in (config.integrator, config.baseline) if plugin is not None)
         with one_thread(config.deterministic), errors_as(f"Integrator '{names}' cannot do this job"):
@@ -140,7 +140,7 @@ class Problem:
         return (self,)
 
     def home(self, view: View) -> tuple[Problem, View]:
-        """Return the single-scene problem that renders a view, and the view as this problem contains it."""
+        """Return the single-scene problem that renders a view, and the corresponding view of that problem."""
         return self, view
 
     def made(self) -> tuple[Pose | Derived, ...]:
@@ -263,7 +263,7 @@ def build_problem(
     baseline = None if config.baseline is None else _gradient_integrator(config.baseline)
     if baseline is not None:
         keys_of(params, config.parameters, config.derived, baseline)
-        _edges(params, keys, baseline)  # suppress the baseline's note: one note is enough
+        _edges(params, keys, baseline)  # called only to suppress the baseline's note
     judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     # Cheap checks come before the rendering of targets.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
@@ -367,7 +367,7 @@ def _kept(disk: DiskStore, variable: Variable) -> Variable:
 
 
 def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list[Variable]:
-    """Make the variable of the exposures. The list is empty if the job has no exposures."""
+    """Return a list that contains the variable of the exposures, or an empty list if the job has no exposures."""
     if (options := config.exposure) is None:
         return []
     value = start_of_exposures(len(views), min(view.target.shape[2] for view in views), options.white_balance)
@@ -419,9 +419,10 @@ def _require_gradients(integrator: mi.Integrator, name: str) -> None:
 
 
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
-    """Return a note for the user if visibility boundaries move with the parameters, and suppress the integrator's note.
+    """Return a note for the user if visibility boundaries move with the parameters.
 
-    The note says that boundary terms are expensive, or that the gradient lacks boundary terms.
+    The note says that boundary terms are expensive, or that the gradient lacks them. It replaces the integrator's own
+    note, which is suppressed.
     """
     moving = [key for key in keys if moves_edges(params, key)]
     known = stateful(integrator)
