@@ -32,7 +32,7 @@ from pathreplay.platform.interrupts import undisturbed
 OLDEST = (2, 60)
 """First version of Ray whose token authentication covers clusters that a program starts."""
 
-# With the value 0, Ray uses loopback addresses. Ray has this variable for systems whose firewalls block clusters.
+# With the value 0, Ray uses only loopback addresses. The variable is meant for systems whose firewalls block clusters.
 _MANY_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _MODE, _TOKEN, _ADDRESS = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"
 _LONGEST_FOLDER = 20
@@ -152,7 +152,7 @@ def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
 
 
 def _start(ray: ModuleType, stack: contextlib.ExitStack, cores: int) -> Cluster:
-    """Start a private cluster, to be ended by ``stack``. Raises PathreplayError if Ray cannot start safely."""
+    """Start a private cluster, which ends when ``stack`` closes. Raises PathreplayError if Ray cannot start safely."""
     temporary = tempfile.gettempdir()
     # mkdtemp admits only this user; Ray's default folder admits all. Paths of sockets may have at most 107 characters.
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=temporary if len(temporary) <= _LONGEST_FOLDER else "/tmp")

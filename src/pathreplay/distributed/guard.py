@@ -1,9 +1,9 @@
 """Removes all processes and files of a private Ray cluster, however the run's process ends.
 
 The guard is a separate process that outlives the run's process. When the run's process ends, the kernel ends the Ray
-processes that the run's process has started. It does not end the children of these Ray processes: without the guard,
-the agents of a killed raylet would run forever. If the raylet is gone, Ray ends the run's process without a message. In
-this case the guard prints the reason.
+processes that the run's process has started, but not the children of these Ray processes. Without the guard, the agents
+of a killed raylet would run forever. If the raylet is gone, Ray ends the run's process without a message. In this case
+the guard prints the reason.
 """
 
 from __future__ import annotations

@@ -54,9 +54,9 @@ class Counts:
     shards: int = 0
     restarts: int = 0
     again: int = 0
-    """Shards that were computed again because their actor was lost."""
+    """Number of shards that were computed again because their actor was lost."""
     twice: int = 0
-    """Late shards that a second actor was also asked to compute."""
+    """Number of late shards that a second actor was also asked to compute."""
 
     def line(self) -> str:
         return (
@@ -135,9 +135,10 @@ class WorkerPool:
         return [(self.calls.pop(reference), reference) for reference in ready]
 
     def fetch(self, call: _Call, reference: Reference) -> list[Answer] | None:
-        """Return one answer per shard of a request. Returns None if the actor was lost or has only built its problem.
+        """Return one answer per shard of a request. Raises the error of an evaluation that failed.
 
-        Raises PathreplayError if no actor is left. Raises the error of an evaluation that failed.
+        Returns None if the actor was lost, or if the request was to build its problem. Raises PathreplayError if no
+        actor is left.
         """
         try:
             answer = self.ray.get(reference)  # does not block: the answer exists, or its actor is lost
@@ -253,7 +254,7 @@ class RayExecutor:
     def _hand_out(
         self, step: Step, shards: Sequence[Shard], size: int, values: Arrays | Reference, learned: Arrays | Reference
     ) -> None:
-        """Send requests to idle actors. ``size`` is the number of bytes of the values, and of a shard's gradients."""
+        """Send requests to idle actors. ``size`` is the number of bytes of the values; gradients have the same size."""
         idle = self.pool.idle()
         for number in step.in_turn(idle):
             late = len(step.again)
@@ -288,7 +289,7 @@ class RayExecutor:
                 )
 
     def _accept(self, answer: Answer) -> Evaluation:
-        """Return the evaluation in the first answer to a shard, and log each warning once."""
+        """Return the evaluation of a shard from its first answer, and log each warning text only once."""
         self.pool.counts.shards += 1
         for line in answer.warnings:
             if line not in self.pool.logged:

@@ -68,12 +68,12 @@ class Scheduler:
     times: dict[tuple[Actor, Kind], int] = field(default_factory=dict)
     """Number of evaluations per actor and kind."""
     waited: dict[Actor, float] = field(default_factory=dict)
-    """Per actor: seconds of other owners' work that it declined in earlier steps, because the owners were faster."""
+    """Per actor: sum of ``refused`` over earlier steps, since the actor last took a shard from another owner."""
     refused: dict[Actor, float] = field(default_factory=dict)
-    """Per actor: seconds of other owners' work that it declined in the current step."""
+    """Per actor: seconds of work that the actor, while idle, left to a faster owner in the current step."""
 
     def begin(self) -> None:
-        """Begin a step: add the declined work of the previous step to that of earlier steps."""
+        """Begin a step: add the seconds in ``refused``, from the previous step, to ``waited``."""
         for actor, seconds in self.refused.items():
             self.waited[actor] = self.waited.get(actor, 0.0) + seconds
         self.refused.clear()
@@ -232,7 +232,7 @@ class Step:
     def lost(self, index: int, actor: Actor) -> None:
         """Mark a shard as waiting because its actor was lost, unless it is done or another actor is evaluating it.
 
-        The lost actor's waiting shards are assigned to the actor that now owns their kind, usually none (see `forget`).
+        The lost actor's waiting shards are reassigned by kind. Usually, their kinds now have no owner; see `forget`.
         """
         self.heard(index, actor)
         self.left.pop(actor, None)

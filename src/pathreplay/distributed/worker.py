@@ -91,7 +91,7 @@ class RayActor:
     def evaluate(self, baseline: bool, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Answer] | None:
         """Evaluate shards with the integrator of the job or of its baseline.
 
-        Returns None if the actor was restarted and has no problem yet.
+        Returns None if the actor was restarted, and `hello` has not been called since.
         """
         return None if self.problem is None else [self._answer(baseline, values, shard, learned) for shard in shards]
 

@@ -1,4 +1,4 @@
-"""Starts a job for ``pathreplay optimize`` and for Python: `optimize` runs all of it, `iterate` step by step."""
+"""Starts jobs for ``pathreplay optimize`` and for Python: `optimize` runs a whole job, `iterate` one step at a time."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def optimize(
     Args:
         config: path of a TOML or YAML file, or a Config, whose relative paths refer to the current folder.
         resume: run folder of an earlier, unfinished run to continue; excludes ``config`` and ``output``.
-        output: run folder to create; default: the config's ``output``, or ``runs/<name of the config>`` without one. If
-            the folder exists, a number is appended: an earlier run is never touched.
+        output: run folder to create; default: the config's ``output``, or ``runs/<name of the config>`` if it has none.
+            If the folder exists, a number is appended: an earlier run is never touched.
         progress: show a progress bar in a notebook or on stderr (periodic lines if stderr is not a terminal).
         define: changes to the config file, each ``KEY=VALUE`` (see docs/optimize.md).
         executor: ``local`` or ``ray``; overrides the config, also for a resumed run.

@@ -29,8 +29,8 @@ class Optimization:
 
     The scene is loaded when the first iteration is requested. At the end of the loop, all results are written and
     ``result`` is set. `stop` ends the run early and also writes all results. `close` ends the run with only a
-    checkpoint to resume from. Leaving a ``with`` block has the same effect, and so has the deletion of the object, for
-    example after the loop is left early. `pathreplay.optimize` describes the effect of signals.
+    checkpoint to resume from. Leaving a ``with`` block has the same effect as `close`, and so has the deletion of the
+    object, for example after the loop is left early. `pathreplay.optimize` describes the effect of signals.
     """
 
     def __init__(self, job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> None:
@@ -65,7 +65,7 @@ class Optimization:
     def stop(self) -> RunResult:
         """End the run after at least one iteration, and write all results.
 
-        Raises PathreplayError for the errors of the loop, and if the run was closed before.
+        Raises the same errors as the loop, and PathreplayError if the run was closed before.
         """
         self._stop.by = self._stop.by or "stop()"
         for _ in self:

@@ -42,7 +42,7 @@ def export_run(run: Path, output: Path | None = None) -> str:
 
     The folder contains `scene.xml` and the files that it references (textures as EXR, grids as `.vol`, meshes as PLY).
     Recovered textures and meshes are also written as PNG and OBJ, cameras as `transforms.json`, small values to
-    `values.json`, and large values outside the scene as NPY. The function sets the variant of the run.
+    `values.json`, and large values outside the scene as NPY. The function activates the variant of the run.
 
     Args:
         run: run folder.
@@ -129,7 +129,7 @@ def _source(job: Job, values: Arrays) -> Source:
 
 
 def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
-    """Return the 8-bit image files of optimized textures, which the run has loaded as floating-point numbers."""
+    """Return the 8-bit image files of optimized textures. The run stored these textures as floating-point numbers."""
     keys = [key for key in values if key.endswith(".data")]
     if not keys:
         return ()
@@ -142,7 +142,7 @@ def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
 def _beside(export: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
     """Return the content of the files that the scene does not reference, by name: PNG, OBJ, NPY, cameras, and numbers.
 
-    ``free`` are parameters outside the scene. Each with more than 16 numbers becomes an NPY file.
+    ``free`` are parameters outside the scene. A parameter in ``free`` with more than 16 numbers becomes an NPY file.
     """
     params, files = mi.traverse(export.scene), {"transforms.json": _json(_cameras(export.scene))}
     names = file_names([*params.keys(), *(shape.id() for shape in export.scene.shapes())])

@@ -89,7 +89,7 @@ def describe(
         arguments: values that replace ``$name`` in the file.
         plugins: new plugin types by the old types that they replace.
         cameras: dictionaries of additional sensors by id.
-        floats: image files of textures to store as floating-point numbers; see `load_file_with`.
+        floats: image files whose textures are stored as floating-point numbers; see `load_file_with`.
 
     Raises:
         RuntimeError: Mitsuba cannot read the scene.
@@ -156,7 +156,7 @@ def _deepest(described: Described, owner: Owner) -> Owner:
     if not dot:
         return owner
     children = dict(described.children(owner.node))
-    if name not in children:  # the property has another name in the file: take the only bitmap
+    if name not in children:  # the path has another name than the description: choose the only bitmap
         pictures = [child for child in children.values() if child.props.plugin_name() == "bitmap"]
         if rest.split(".")[-1] != "data" or len(pictures) != 1:
             return owner

@@ -24,7 +24,7 @@ from pathreplay.scenes.descriptions import errors_as
 _A_PASS = 2**24
 # Bytes per sample during a pass, for two copies of the state of its random number generator.
 _A_SAMPLE = 64
-# Largest width and height in pixels. A larger size is probably a typo, for which Mitsuba raises an error at best.
+# Largest width and height in pixels. A larger size is probably a typo. Mitsuba would at best raise an error.
 _LARGEST_SIDE = 2**16
 
 Told = Callable[[int, int], None]
@@ -87,9 +87,9 @@ def set_size(sensor: mi.Sensor, size: str) -> None:
 def passes(sensor: mi.Sensor, spp: int) -> list[int]:
     """Return the samples per pixel of each pass. Their sum is ``spp``, or more if the sampler rounds up.
 
-    Samplers other than `independent` stratify the samples of a pixel. Such samples are split into passes only if Dr.Jit
-    or the memory cannot hold all samples at once. Each pass then has a power of four samples per pixel, which all
-    samplers accept.
+    Samplers other than `independent` stratify the samples of a pixel. With these samplers, several passes are used only
+    if all samples at once would exceed Dr.Jit's limit or the memory. Each pass then has a power of four samples per
+    pixel, which all samplers accept.
 
     Raises PathreplayError if the image does not fit into memory.
     """

@@ -25,9 +25,9 @@ _ALSO_PLACES = {
     "point": ("position",),
     "directional": ("direction",),
 }
-"""Properties by plugin that `mi.traverse` includes in `to_world`."""
+"""Properties by plugin whose effect `mi.traverse` includes in `to_world`. An exported `to_world` replaces them."""
 
-# The classes that are supported as material or emitter of an existing mesh object: plugin and its only property.
+# Materials and emitters of existing mesh objects that can be exported: class, plugin, and the plugin's only property.
 _KNOWN = {"SmoothDiffuse": ("diffuse", "reflectance"), "AreaLight": ("area", "radiance")}
 _PLAIN_SPECTRA = ("SRGBReflectanceSpectrum", "UniformSpectrum")
 

@@ -57,7 +57,7 @@ class Source:
     cameras: Mapping[str, Mapping[str, object]]
     """Additional sensors by id."""
     floats: Collection[str] = ()
-    """Image files of textures that are stored as floating-point numbers; see `load_file_with`."""
+    """Image files whose textures are stored as floating-point numbers; see `load_file_with`."""
 
     def load(self) -> mi.Scene:
         """Load the scene. Raises the errors of Mitsuba and of `load_file_with`."""
@@ -140,7 +140,7 @@ def _alike(value: object, other: object) -> bool:
     try:
         a, b = (_numbers(x) for x in (value, other))
     except (TypeError, ValueError):
-        return True  # not numeric, such as scalar vectors, which no run optimizes
+        return True  # values that are not numeric arrays, such as scalar vectors: no run optimizes them
     if a.size == 0 or b.size == 0:
         return a.size == b.size
     a, b = (x.astype(np.float64).ravel() for x in (a, b))

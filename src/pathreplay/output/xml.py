@@ -42,8 +42,8 @@ def scene_xml(described: Described, from_file: bool) -> bytes:
 class _Names:
     """The ids of objects in the XML file.
 
-    Objects that are used more than once have an id. Objects that the user has named keep their ids: all of them in a
-    file, and in a dictionary only those whose names are part of parameter keys.
+    Objects that are used more than once have an id. Ids in a scene file are kept. In a dictionary, only names that are
+    part of parameter keys are kept: the names of objects directly in the scene or in a shape group.
     """
 
     def __init__(self, described: Described, uses: Counter[int], from_file: bool) -> None:

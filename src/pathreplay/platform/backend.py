@@ -2,8 +2,9 @@
 
 Dr.Jit searches for libLLVM once, when `drjit` is imported. It loads the file named by DRJIT_LIBLLVM_PATH, or else the
 newest libLLVM in a few folders. The variable must therefore be set before the import, and `import pathreplay` calls
-`point_drjit` first. `point_drjit` tests no library, because pip's library is known to work. `set_variant` and the
-doctor test libraries in a subprocess (pathreplay.platform.llvm).
+`point_drjit` first. `point_drjit` tests no library, because the libLLVM that pathreplay installs as a dependency (wheel
+karellen-llvm-core) is known to work. `set_variant` and `pathreplay doctor` test libraries in a subprocess
+(pathreplay.platform.llvm).
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ logger = logging.getLogger("pathreplay")
 def point_drjit() -> None:
     """Make Dr.Jit load a working libLLVM, without testing it. Raises nothing.
 
-    If drjit is not imported yet, DRJIT_LIBLLVM_PATH is set to pip's library, or else to the newest system library that
-    is not known to fail. A value that names a loadable library is kept. If drjit is already imported, a loaded library
-    that is known to fail is replaced.
+    If drjit is not imported yet, DRJIT_LIBLLVM_PATH is set to the libLLVM of the wheel karellen-llvm-core, or else to
+    the newest system library that is not known to fail. A previous value that names a loadable library is kept. If
+    drjit is already imported, a loaded library that is known to fail is replaced.
     """
     if "drjit" in sys.modules:
         path = None if loaded_is_plausible() else _untried_choice()
@@ -126,8 +127,8 @@ def warn_of_bad_llvm() -> None:
 def ensure_llvm() -> None:
     """Ensure that Dr.Jit's LLVM back end works in this process.
 
-    If Dr.Jit has loaded pip's library, no test is made. Any other library is tested (0.3 s), and replaced if the test
-    fails.
+    If Dr.Jit has loaded the libLLVM of the wheel karellen-llvm-core, no test is made. Any other library is tested
+    (0.3 s), and replaced if the test fails.
 
     Raises PathreplayError if no library works, or if the loaded library can no longer be replaced.
     """

@@ -2,8 +2,8 @@
 
 On LLVM, the lanes of one vector packet per thread run at the same time, and local memory is part of each thread's
 stack. A GPU reserves local memory for every thread that can be resident, whatever the launch size. For example, 2048
-path records of 124 bytes, for 2048 threads on each of 132 multiprocessors, take 69 GB. Records of long paths are
-therefore for CPUs only.
+vertex records of 124 bytes per thread, for 2048 threads on each of 132 multiprocessors, take 69 GB. Long paths are
+therefore recorded only on CPUs.
 
 The figures for GPUs were measured on an H100 (docs/memory.md) and are tested with simulated devices. `pathreplay doctor
 --gpu` measures them on other GPUs.
@@ -19,10 +19,10 @@ from pathreplay.errors import PathreplayError
 from pathreplay.platform import memory
 
 SHARE = 0.25
-"""Fraction of GPU memory that records may take; the rest is for the scene, the film and other processes."""
+"""Fraction of GPU memory that vertex records may take; the rest is for the scene, the film and other processes."""
 LARGEST_LOCAL = 56 * 1024
 """Largest number of bytes of local memory per CUDA thread. OptiX provides a stack of 64 KiB, and crashes the process if
-the stack overflows. A record of 560 x 96 bytes fits; a record of 700 x 96 bytes does not."""
+the stack overflows. 560 records of 96 bytes fit; 700 records of this size do not."""
 FEWEST_RECORDS = 9
 """Smallest number of records that are allocated on a GPU. Arrays of up to eight entries would be kept in registers.
 Dynamic indexing of registers makes a pass more than twice as slow."""

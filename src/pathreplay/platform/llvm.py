@@ -25,7 +25,7 @@ from pathlib import Path
 from pathreplay.errors import PathreplayError
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
-#: The user's value of the variable. `import pathreplay` may set the variable, or replace a value that cannot work.
+#: The user's value of DRJIT_LIBLLVM_PATH, which `import pathreplay` may later set, or replace if it cannot work.
 ASKED_FOR = os.environ.get(ENVIRONMENT_VARIABLE, "")
 PIP_DISTRIBUTION = "karellen-llvm-core"
 OLDEST_USABLE_MAJOR = 17
@@ -42,8 +42,9 @@ WAY_OUT = (
 class LlvmLibrary:
     """A libLLVM and the result of its test.
 
-    `version` is the version that the library reports, such as "23.1.4". If the library crashed before, `version` is
-    taken from its file name, and may be "". `message` is "" if the library works, otherwise a one-line reason.
+    `version` is the version that the library reports, such as "23.1.4". If the library crashes before it reports a
+    version, `version` is taken from the file name, and may be "". `message` is "" if the library works, otherwise a
+    one-line reason.
     """
 
     path: str
@@ -127,7 +128,7 @@ def system_libraries() -> list[str]:
 def candidates() -> Iterator[tuple[str, str]]:
     """Yield (path, origin) of each libLLVM to test, in order of preference, each file once."""
     pip = pip_library() or ""
-    # In a subprocess, the variable may name pip's library because the parent has set it: the origin is still pip.
+    # In a subprocess, the variable may name the wheel's library because the parent has set it. The origin is still pip.
     named = ((ASKED_FOR, "pip" if ASKED_FOR == pip else ENVIRONMENT_VARIABLE), (pip, "pip"))
     seen = {""}
     for path, origin in (*named, *((path, "system") for path in system_libraries())):

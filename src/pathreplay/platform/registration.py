@@ -49,7 +49,7 @@ def register(variant: str, plugins: Plugins = PLUGINS) -> None:
 
 
 def mitsuba_integrator() -> Any:
-    """Return Mitsuba's ADIntegrator of the active variant. Its `prepare` seeds the sampler of a pass as in Mitsuba."""
+    """Return Mitsuba's ADIntegrator of the active variant, whose `prepare` seeds the sampler of each pass."""
     # Mitsuba executes this module again for every variant. An import from the public `mitsuba.ad` would create a copy
     # that stays bound to the first variant.
     from mitsuba.python.ad.integrators.common import ADIntegrator

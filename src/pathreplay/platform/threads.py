@@ -11,9 +11,9 @@ import drjit as dr
 def spare_thread() -> AbstractContextManager[None]:
     """Use at least two threads within this block, in which Mitsuba reads files.
 
-    Mitsuba 3.9 submits the blocks of an EXR file to the pool, and the submitting thread waits without executing any. A
-    process restricted to a single core (`taskset -c 0`, small containers) has a pool of one thread, which would wait
-    forever. Writing has the same defect; `exr_bytes` writes without Mitsuba.
+    Mitsuba 3.9 submits the blocks of an EXR file to the pool, and the submitting thread only waits. A process that is
+    restricted to a single core (`taskset -c 0`, small containers) has a pool of one thread, which would wait forever.
+    Writing has the same defect; `exr_bytes` writes without Mitsuba.
     """
     return _threads(max(2, dr.thread_count()))
 

@@ -12,10 +12,11 @@ angle, transmission is sampled with a probability of at least 1/4. Near the crit
 with the small probability 1 - F would contribute nearly all of the derivative.
 
 The direction wo and the weight are differentiated with respect to `eta` and si.wi. The weight is also differentiated
-with respect to the tints. The probability of choosing a lobe and the onset of total internal reflection are *not*
-differentiated (F is continuous at the onset). bs.pdf is detached, and the weight is f / detach(pdf). The value of the
-weight is therefore the tint (times s), while its derivative contains the Fresnel term. If an edge of the scene is seen
-through a lobe, the motion of the edge is a boundary term, which belongs to the integrator.
+with respect to the tints `specular_reflectance` and `specular_transmittance`. The probability of choosing a lobe and
+the onset of total internal reflection are *not* differentiated (F is continuous at the onset). bs.pdf is detached, and
+the weight is f / detach(pdf). The value of the weight is therefore the tint (times s for transmission), while its
+derivative contains the Fresnel term. If an edge of the scene is seen through a lobe, the motion of the edge is a
+boundary term, which belongs to the integrator.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ class DielectricAD:
         if not (has_r or has_t):
             return bs, mi.Spectrum(0)
 
-        # Fresnel reflectance, and relative index along (it) and against (ti) the direction of travel
+        # Fresnel reflectance, cos θ_t, and relative index along (η_it) and against (η_ti) the direction of travel
         F, cos_t, η_it, η_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.eta)
         # Under total internal reflection, F is 1 at all angles. The derivative that mi.fresnel returns there is a
         # rounding error divided by cos θ_i.

@@ -22,8 +22,9 @@ from pathreplay.plugins.supergrid import Bounds
 
 T = TypeVar("T")
 
-#: Rate of residual collisions relative to the largest residual density. The value 2 halves the exponent in the variance
-#: (see `control`). The value 4 costs more time than the lower noise saves (`pathreplay bench gridmedium`).
+#: Rate of residual collisions relative to the largest residual density. Compared with the value 1, the value 2 halves
+#: the exponent in the variance (see `control`). The value 4 costs more time than the lower noise saves (`pathreplay
+#: bench gridmedium`).
 DENSER = 2.0
 #: Largest value of ∫ (σ - c)²/m ds over one cell, if σ is the lowest density of the cell along the whole ray. This
 #: integral is about the relative variance that the cell adds to the transmittance (see `control`). A ray crosses 10 to
@@ -156,8 +157,8 @@ def free_flight(
 ) -> tuple[mi.Float, mi.Float]:
     """Sample the distance of the next tentative collision; return the distance and the majorant there.
 
-    The distance t solves ∫_0^t m ds = -log(1 - u). The majorant m (1 / unit length) is the value of the cell, and 0
-    outside ``box``. If there is no solution, the distance is infinite and the majorant 0.
+    The distance t solves ∫_0^t m ds = -log(1 - u), with ``u`` in [0, 1). The majorant m (1 / unit length) is the value
+    of the cell, and 0 outside ``box``. If there is no solution, the distance is infinite and the majorant 0.
     """
     a, b = clip(box, ray)
     τ = -dr.log(1 - u)
@@ -192,11 +193,11 @@ def free_flight(
 
 
 def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Compute control density c and residual collision rate m per cell, for the density ``scale`` times the volume.
+    """Compute control density c and residual collision rate m per cell, for density σ = ``scale`` times the volume.
 
-    The relative variance of the transmittance is exp(∫ (σ - c)²/m ds) - 1. On average, it is lowest if c is the mean
-    density. However, a ray may pass only through the lowest density of a cell, and (σ - c)²/m is then large in a dense
-    cell. c is therefore limited, so that the integral over such a ray in one cell does not exceed RISK.
+    The relative variance of the transmittance is exp(∫ (σ - c)²/m ds) - 1. The mean density as c minimizes the integral
+    on average. However, if a ray passes only through the lowest density of a cell, the integral over this cell can be
+    large. c is therefore limited, so that the integral over one cell does not exceed RISK for such a ray.
     """
     lowest, highest = _scaled(bounds, scale)
     length = 2 / bounds.faces_per_length  # twice the mean length of a ray in a cell

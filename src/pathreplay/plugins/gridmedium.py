@@ -97,7 +97,7 @@ class GridMedium:
         dr.make_opaque(self.majorant)
 
     def _cheapest_cells(self, values: Sequence[tuple[mi.Float, ...]]) -> grid_traversal.Cells:
-        """Return the cells of the cheapest level. ``values`` has a tuple per level, whose last entry is the rate."""
+        """Return the cells of the cheapest level. ``values`` has a tuple per level, with the rate as its last entry."""
         rates = [dr.mean(numbers[-1]) for numbers in values]
         dr.eval(values, rates)
         last = len(values) - 1
@@ -201,7 +201,7 @@ def _choice(props: mi.Properties) -> bool | str:
 
 
 def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
-    """Return whether channels of a volume differ, and a list of levels of bounds, from the finest to a single cell."""
+    """Return whether channels of a volume may differ, and bounds per cell size, from finest to a single cell."""
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]
     if volume.class_name() == "GridVolume":

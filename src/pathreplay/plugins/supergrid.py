@@ -189,7 +189,7 @@ def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np
 
 
 def _merged(values: Values, axis: int, near: NDArray[np.int64], inside: NDArray[np.int64]) -> Values:
-    """Merge values along axis 0, 1 or 2 (x, y, z): extremes over the indices ``near``, means over those ``inside``."""
+    """Merge values along axis 0, 1 or 2 (x, y, z): extremes over indices ``near``, means over indices ``inside``."""
 
     def pool(value: mi.TensorXf, table: NDArray[np.int64], merge: Callable) -> mi.TensorXf:
         before = [slice(None)] * (2 - axis)

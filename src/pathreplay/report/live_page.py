@@ -122,7 +122,7 @@ class Previews:
             self._write({})
 
     def _dropped_frames(self, done: int) -> set[int]:
-        """Note that there are frames for iteration ``done``; return the iterations whose frames must be removed.
+        """Record that iteration ``done`` has frames, and return the iterations whose frames must be removed.
 
         The first and the latest frames stay. The frames in between are thinned to about equal intervals.
         """
@@ -158,7 +158,7 @@ class Previews:
         return files
 
     def _begun(self) -> dict[str, bytes]:
-        """Return the first preview files by name: images of views, and of initial and true textures and volumes."""
+        """Return the first preview files by name: images of the views, and initial and true textures and volumes."""
         files = self._of_views()
         for item in recovered_of(self.problem, self.run):
             for kind, image in _grids(item).items():
@@ -181,7 +181,8 @@ class Previews:
     def _continued(self) -> None:
         """Clean up files of an earlier part of the run. Called after the first step, when resuming has succeeded.
 
-        A killed run may have written frames after its last checkpoint, which do not belong to the resumed run.
+        A killed run may have written frames after its last checkpoint. These frames are removed, because the resumed
+        run repeats these iterations.
         """
         self._remove_frames(lambda iteration: iteration > self._resumed)
         self._kept = sorted({0, *(iteration for iteration, _, _ in frames(self.folder.path))})

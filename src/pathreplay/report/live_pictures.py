@@ -61,7 +61,7 @@ class LivePictures:
         """Number of completed iterations when the latest images were rendered."""
 
     def observe(self, event: Event) -> None:
-        """Render images if they are due. In a run with a live page, `Previews` calls the other methods instead."""
+        """Render images if they are due. `Previews` calls `is_due`, `look` and `paid` instead."""
         if isinstance(event, Stepped) and self.is_due(event.entry.seconds):
             begin = time.perf_counter()
             with self._problem.computing():
@@ -70,7 +70,7 @@ class LivePictures:
 
     def is_due(self, seconds: float) -> bool:
         """Return whether images are due after an iteration that took ``seconds``."""
-        # Before the first images, their cost is estimated by the duration of an iteration, which is longer.
+        # Until the first images are rendered, their cost is assumed to be that of an iteration, which is higher.
         allowed = self.share * (time.perf_counter() - self._began)
         return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
 

@@ -44,7 +44,7 @@ class ViewPictures:
     """Weight per pixel; None if all weights are equal."""
     is_test: bool = False
     factors: tuple[float, ...] = ()
-    """Recovered exposure: factors by which the result is multiplied, one for all or one per colour channel."""
+    """Recovered exposure: factors by which the result is multiplied, one for all channels or one per channel."""
 
     def error(self, image: Image) -> float:
         """Return the weighted root mean square difference of an image from the target."""
@@ -53,7 +53,7 @@ class ViewPictures:
 
     @cached_property
     def likenesses(self) -> dict[str, Likeness]:
-        """Weighted image metrics at the exposure of the view, by kind: 'result', 'start' and, if any, 'baseline'."""
+        """Return weighted image metrics at the view's exposure, by kind: 'result', 'start' and, if any, 'baseline'."""
         images = {"result": self.result, "start": self.start, "baseline": self.baseline}
         return {
             kind: Likeness.of(image, self.target, self.exposure, self.weight, flip=self.is_test)
@@ -221,7 +221,7 @@ class RecoveredPose:
 
 @dataclass(frozen=True)
 class Contestant:
-    """One side of the comparison at equal time: the run of the job, or that of its baseline.
+    """One side of the comparison at equal time: the run of the job, or the run of its baseline.
 
     ``errors`` are the final errors of parameters and poses, by name.
     """

@@ -322,10 +322,10 @@ def summary(outcome: Outcome) -> bytes:
             pixels = displayed(shown(image, SUMMARY_SIDE), exposure)
             line[column].imshow(pixels, interpolation="nearest", vmin=0, vmax=1, cmap="gray")
             label = outcome.caption(kind)
-            short = name if len(name) <= 24 else f"…{name[-23:]}"  # fits above an image
+            short = name if len(name) <= 24 else f"…{name[-23:]}"  # a longer title is wider than an image
             line[column].set_title(label if column else f"{short}: {label}", fontsize=8)
-    # Reduce the image to 256 colours, so that noisy images are small enough for a README or a mail. Pillow only dithers
-    # if it is given a palette.
+    # Reduce the image to 256 colours, so that noisy images are small enough for a README or a mail. The palette is an
+    # argument, because Pillow does not dither if it chooses the palette itself.
     picture = PIL.Image.open(io.BytesIO(drawn(figure, "png"))).convert("RGB")
     buffer = io.BytesIO()
     picture.quantize(palette=picture.quantize(256)).save(buffer, "png", optimize=True)

@@ -62,7 +62,7 @@ class RunFolder:
 
     Args:
         given: path of the folder, absolute or relative to ``home``.
-        home: folder to which ``given`` refers; default: the folder that is current at construction.
+        home: folder to which a relative ``given`` refers; default: the current folder at construction.
         in_python: whether the job has Python objects; see `Job`.
     """
 
@@ -252,7 +252,7 @@ def open_run_folder(path: Path, in_python: bool = False) -> tuple[Job, RunFolder
 
     Raises:
         PathreplayError: ``path`` is not a run folder, has no checkpoint, or is damaged or in use. Also raised if
-            ``in_python`` differs from whether the job has Python objects.
+            the job has Python objects and ``in_python`` is False, or vice versa.
     """
     require_writable_name(path, "--resume")
     copy = _config_in(path)
@@ -296,7 +296,7 @@ def _config_in(path: Path) -> Path:
 
 def _job(path: Path, copy: Path) -> Job:
     try:
-        if problem := file_problem(path / "run.json", 2**20):  # bytes: far more than a few paths need
+        if problem := file_problem(path / "run.json", 2**20):  # limit in bytes, far more than a few paths need
             raise ValueError(f"it {problem}")
         origin = _Origin.model_validate_json((path / "run.json").read_bytes())
         if "\0" in origin.base + (origin.config or ""):
@@ -327,7 +327,7 @@ def new_output(output: str | Path | None, source: Path | None) -> Path:
 
 
 def require_writable_name(path: Path, option: str) -> None:
-    """Raise PathreplayError if the path is invalid, or is not UTF-8, which reports require."""
+    """Raise PathreplayError if the path is invalid, or cannot be encoded in UTF-8, the encoding of reports."""
     try:
         str(path).encode()
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -340,7 +340,7 @@ def require_writable_name(path: Path, option: str) -> None:
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Remove those of the folders that are empty. Another process may have put files into a folder."""
+    """Remove the folders, except those into which another process has put files."""
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()

@@ -1,4 +1,4 @@
-"""Saves a run in its folder as first files and periodic checkpoints, and restores runs from these files."""
+"""Writes the initial files and periodic checkpoints of a run, and restores runs from these files."""
 
 from __future__ import annotations
 
@@ -65,9 +65,10 @@ class Saving:
 
 
 def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, Content]:
-    """Return the first files of a run, by name: targets, weights, initial images, their checksums, and checkpoints.
+    """Return the initial files of a run, by name: targets, weights, initial images, checksums, and checkpoints.
 
-    The run can be resumed from these files. ``before`` are the images at the initial values by view name.
+    The checksums cover the targets, weights and images. The run can be resumed from these files. ``before`` are the
+    images at the initial values by view name.
     """
     pictures = {_picture("target", view.name): view.target for view in problem.views}
     pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}

@@ -38,10 +38,10 @@ def check_all(
     boundary: Mapping[str, object] | None = None,
     **options: Any,
 ) -> Iterator[GradientCheck]:
-    """Yield ``check_gradient(scene, key, **options)`` for each key that matches the patterns, as soon as it is done.
+    """Yield the result of ``check_gradient(scene, key, **options)`` for each key that matches the patterns.
 
-    Progress goes to standard error. ``boundary`` holds additional properties of `pathreplay`. Raises the same errors as
-    :func:`check_gradient` and :func:`resolve_differentiable`.
+    Progress is shown on standard error. ``boundary`` contains additional properties of the integrator `pathreplay`.
+    Raises the same errors as :func:`check_gradient` and :func:`resolve_differentiable`.
     """
     tested = integrator_under_test(integrator, scene, max_depth, boundary)
     keys = resolve_differentiable(traversed(scene), patterns, tested)

@@ -20,8 +20,8 @@ from pathreplay.scenes.spectra import coefficients, values_of_p
 from pathreplay.testing.stencil import BACKWARD, CENTRAL, FORWARD, Stencil
 
 RELATIVE_STEP = 1e-2
-"""Step h relative to the size of the parameter. The relative error of finite differences is then near 1e-4 due to
-truncation, h², and near 1e-5 due to float32 rounding of images."""
+"""Step h relative to the size of the parameter. The relative error of finite differences is then about 1e-4 from
+truncation (proportional to h²), and about 1e-5 from the float32 rounding of images."""
 
 # Parameters that may be negative. All other parameters without negative entries are treated as bounded by 0.
 _SIGNED = ("vertex_positions", "vertex_normals", "vertex_texcoords", "to_world", "to_uv", "position", "direction")
@@ -78,7 +78,7 @@ def choose_line(
             raise PathreplayError(f"Direction for '{key}' is zero, NaN or infinite; give finite numbers, not all zero")
     else:
         v, description = _random_direction(value, transform, far, spectra, seed)
-    # Spectral coefficients have no typical size: a black texel has p = -8192, which must not determine the step of all.
+    # Spectral coefficients have no typical size: a black texel has p = -8192, which would give all texels a huge step.
     size = 1.0 if spectra else max(1.0, float(np.abs(value[v != 0]).max()))
     if step is None:
         step = RELATIVE_STEP * size / ((float(np.abs(values_of_p(v)[..., :3]).max()) if spectra else 0) or 1)
@@ -136,6 +136,6 @@ def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
             return FORWARD
         if (value - 2 * move >= 0).all():
             return BACKWARD
-    # Both one-sided stencils reach negative values, for example at zeros with a given direction of mixed signs. Then
-    # central differences are used as well: parameters in which the image is linear tolerate negative values.
+    # Use central differences also if both one-sided stencils would reach negative values, for example at zeros of the
+    # parameter if a given direction has mixed signs. Negative values are harmless if the image is linear in them.
     return CENTRAL

@@ -50,7 +50,7 @@ TIMINGS: dict[str, tuple[Json, int, int, int]] = {
         ("replay", "pathreplay", {"adjoint": "replay"}),
     )
 }
-# Timings of recorded paths and of replay at large depth, between which adjoint = 'auto' chooses.
+# Timings at large depth of recorded paths and of replay, the two methods between which adjoint = 'auto' chooses.
 TIMINGS |= {
     f"{adjoint}, 512 x 512, depth {depth}": ({"type": "pathreplay", "adjoint": adjoint}, 512, 16, depth)
     for adjoint, depth in (("recorded", 256), ("recorded", 448), ("replay", 448), ("replay", 2048))

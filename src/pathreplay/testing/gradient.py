@@ -88,7 +88,7 @@ def check_gradient(  # noqa: PLR0913 (most are keyword-only)
 ) -> GradientCheck:
     """Compare a directional derivative of the image with finite differences, over independent seeds.
 
-    The derivative is dF/dt at t = 0, where F is the weighted mean of the image (see ``loss``) for the parameter
+    The derivative is dF/dt at t = 0. F(t) is the weighted mean of the image (see ``loss``) if the parameter is set to
     value + t · direction.
 
     Args:

@@ -1,7 +1,8 @@
 """The objective of a check, F(t): a weighted mean of the image, as a function of one parameter along a curve.
 
-F(π) = Σ_k w_k I_k(π) / n is linear in the image. The gradient of one noisy image is therefore an unbiased sample of the
-gradient of F, and the difference of two noisy images is an unbiased sample of a difference of F.
+F(π) = Σ_k w_k I_k(π) / n, with the parameter π, the n values I_k of the image and their weights w_k, is linear in the
+image. The gradient of one noisy image is therefore an unbiased sample of the gradient of F, and the difference of two
+noisy images is an unbiased sample of a difference of F.
 """
 
 from __future__ import annotations
@@ -177,8 +178,8 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
     """Return w / n with w = 1 + cos(2π (0.7 x + 0.4 y + c/3)) / 2 for pixel (x, y) in [0, 1]² and channel c.
 
     The weights are positive and smooth, because random signs would reduce the signal (see `direction`). The wave runs
-    obliquely across the image and is out of phase between channels, so that mirror symmetry of the scene does not make
-    it constant.
+    obliquely across the image and is out of phase between channels. Otherwise, a mirror symmetry of the scene could
+    make the weighted mean constant.
     """
     height, width, channels = shape
     y, x, c = np.ogrid[:height, :width, :channels]
@@ -189,7 +190,7 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
 
 
 def integrator_name(integrator: mi.Integrator) -> str:
-    """Return the integrator's name in scene files ('prb' for PRBIntegrator), and its boundary terms unless 'auto'."""
+    """Return the integrator's name in scene files ('prb' for PRBIntegrator), and its ``boundary`` if not 'auto'."""
     # For Python plugins Mitsuba's class_name() returns the name of the C++ base class.
     name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     name = name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()

@@ -71,8 +71,8 @@ def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> 
     """Return the integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
 
     Russian roulette is disabled if paths are short enough. This does not change the expected image. Without roulette,
-    no decision to end a path differs between +h and -h, and throughputs may be negative. Negative throughputs occur if
-    -h makes a reflectance negative.
+    no decision to end a path differs between +h and -h. Roulette also cannot handle negative throughputs, which occur
+    if -h makes a reflectance negative.
 
     Raises PathreplayError if the path length of the tested integrator cannot be read, or ``spec`` cannot be created.
     """

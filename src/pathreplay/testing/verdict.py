@@ -50,7 +50,7 @@ class Judgement:
     reference: float
     reference_se: float
     step_error: float
-    """Bound on the systematic error of the reference: truncation beyond noise, and rounding."""
+    """Bound on the systematic error of the reference: rounding, and truncation as far as it exceeds the noise."""
     z: float
     resolution: float
     """σ / max(|gradient|, |reference|); infinite if both are zero."""

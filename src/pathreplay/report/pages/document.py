@@ -35,8 +35,8 @@ def template(name: str) -> jinja2.Template:
 def document(page: Page, live: bool = False) -> bytes:
     """Render the page as HTML in UTF-8.
 
-    A ``live`` page is served by `watch`: it polls for updates, and has a button to stop the run. A saved page contains
-    its content security policy. For a live page, the server sends the policy in a header.
+    A ``live`` page, which `watch` serves, polls for updates and has a button to stop the run. A saved page contains its
+    content security policy. For a live page, the server sends the policy in a header.
     """
     html = template("page.html.j2").render(
         page=page, live=live, policy="" if live else policy("data:"), data=_data(page, live),

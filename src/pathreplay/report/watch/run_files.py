@@ -81,7 +81,7 @@ def page(run: Path) -> Page:
 
 
 def holder(run: Path) -> str | None:
-    """Return the process that the run's lock file names; None if this process has ended.
+    """Return the process that the run's lock file names; None if the named process has ended.
 
     Processes on other machines cannot be checked, and count as running.
     """

@@ -88,7 +88,7 @@ def _pictures(run: Path, view: str | None) -> list[PIL.Image.Image]:
 
 
 def _side_by_side(pictures: Mapping[str, PIL.Image.Image], sizes: list[tuple[int, int]]) -> PIL.Image.Image:
-    """Draw images in these sizes, with a label below each image, into one frame.
+    """Draw images side by side into one frame, scaled to ``sizes``, with a label below each image.
 
     The frame's width and height are even, as video encoders require.
     """
