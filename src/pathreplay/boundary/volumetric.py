@@ -6,8 +6,8 @@ film therefore has an edge, which short segments with constant τ find (see `cro
     dI/dπ = - Σ K dB/dπ,    K = π/2 · f / (l p(c) p(τ) N) · sgn(w·∂B/∂s) / |∂B/∂s|,    B = n·(x + r d - z),
 
 where f is the radiance that the lit side scatters to the camera, including the transmittances from the light to x and
-from x to the camera. In dB/dπ, x moves as in the interior term. ∂B/∂s is taken at constant τ, because the domain of the
-integral consists of film positions and distances.
+from x to the camera, and N is the number of segments. In dB/dπ, x moves as in the interior term. ∂B/∂s is taken at
+constant τ, because the domain of the integral consists of film positions and distances.
 """
 
 from __future__ import annotations
