@@ -1,4 +1,4 @@
-"""Edges that are not outlines: contacts of two surfaces, borders of black smooth shading, hard shadow boundaries.
+"""Edges other than outlines: surface contacts, hard shadow boundaries, lines where smooth shading turns black.
 
 A smooth-shaded mesh turns black where its shading normal is perpendicular to the ray, slightly before its outline.
 """

@@ -240,7 +240,7 @@ class EmitterSegment(PlaneSegment):
         jump *= bracket.per_length(self.length, mi.Float(INSIDE**-2)) * dr.select(a.hidden, -1, 1)
         active &= dr.any(jump != 0) & dr.all(dr.isfinite(jump))
         u, u_lit = (self.at(dr.select(a.hidden, *t)) for t in ((bracket.a, bracket.b), (bracket.b, bracket.a)))
-        own = active & observer.separates(lit.light.d, dark.light.d)  # not ray.d: ray origins are offset
+        own = active & observer.separates(lit.light.d, dark.light.d)  # not ray.d, because ray origins are offset
         n = edge_normal(dark.hit, dark.ray, active)
         crossing = ShadowCrossing(jump, self, u, lit, dark, n, own, active)
         return crossing.weighted(self.direction(bracket.a), u_lit)

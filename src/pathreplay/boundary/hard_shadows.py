@@ -33,7 +33,7 @@ class ShadowTest:
 
     @staticmethod
     def of(trace: TraceConfig, at: Arrival, sampler: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
-        """Test whether the light sampled at a path's k-th vertex reaches it. ``sampler`` is set to this vertex."""
+        """Test whether a path's k-th vertex receives light from its emitter sample. ``sampler`` is set to the vertex."""
         u = VertexSamples.draw(sampler).light
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
         test = ShadowTest.at(trace, si, u, _scatters(trace, si, k, active))

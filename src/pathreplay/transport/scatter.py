@@ -79,7 +79,7 @@ def choose(
 def _in_medium(
     v: Vertex, at: Arrival, u: VertexSamples, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool, surface: Sampled
 ) -> Sampled:
-    """Replace ``surface`` by a phase function sample at collisions, and by straight transmission at null boundaries."""
+    """Replace the sample at collisions by a phase function sample, and at null boundaries by straight transmission."""
     event, through, phase, ctx = v.inside.event, v.inside.through, v.inside.phase, mi.PhaseFunctionContext(None)
     f, pdf_light = phase.eval_pdf(ctx, v.inside.mei, d, lit & event)
     wo, w, pdf = phase.sample(ctx, v.inside.mei, u.lobe, u.direction, go_on & event)

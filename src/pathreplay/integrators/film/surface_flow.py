@@ -1,7 +1,7 @@
 """Flow of a static camera: film positions follow the visible surfaces, so that surfaces move little under a pixel.
 
-A few probe rays sample the scene. A point p that a probe ray hits moves with its surface. Its image moves on
-the film with the velocity
+A few probe rays sample the scene. A point p that a probe ray hits moves with its surface. The image of p
+moves on the film with the velocity
 
     u = (∂(o + t d)/∂s)⁺ ∂p/∂π,
 
