@@ -33,7 +33,7 @@ class ShadowTest:
 
     @staticmethod
     def of(trace: TraceConfig, at: Arrival, sampler: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
-        """Test whether a path's k-th vertex receives light from its emitter sample. ``sampler`` is set to the vertex."""
+        """Test whether a path's k-th vertex receives light from its emitter sample; ``sampler`` is at this vertex."""
         u = VertexSamples.draw(sampler).light
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
         test = ShadowTest.at(trace, si, u, _scatters(trace, si, k, active))
