@@ -170,6 +170,6 @@ def backward(target: mi.Float) -> None:
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):
-            return  # Loops and calls are evaluated step by step: another step may still depend on a parameter.
+            return  # Dr.Jit evaluates each iteration of a loop: another iteration may have gradients.
         raise Unreached("no parameter with gradients reaches the light paths")
     dr.backward_from(target)

@@ -3,8 +3,9 @@
 Two averages are kept for each cell of position and direction. X is the mean radiance along rays with a real collision
 in the cell, and Y along rays that pass through the cell. With p the probability of a real collision, the baseline is
 b = (1 - p) X + p Y. Only earlier passes contribute to b, which is therefore independent of the current pass. The
-control variate of `fly_again` then has mean zero for any b, provided that b is zero where neither real nor kept null
-collisions occur. A poor estimate increases noise and causes no bias. Nothing in this module is differentiated.
+control variate of `fly_again` then has mean zero for any b, provided that b is zero where neither real collisions nor
+the null collisions of `null_branching` occur. A poor estimate increases noise and causes no bias. Nothing in this
+module is differentiated.
 """
 
 from __future__ import annotations
@@ -174,7 +175,7 @@ class BaselineState:
                 f"the learned baseline of the media has the shapes {shapes} instead of {wanted}, "
                 "or a branching weight outside (0, 1]: start a new run"
             )
-        # Copy into memory of Dr.Jit: recorded passes require the same alignment.
+        # Copy into memory that Dr.Jit has allocated: recorded passes require the alignment of such memory.
         one = dr.opaque(mi.Float, 1)
         sums, branching = (mi.Float(np.array(learned[name], np.float32)) * one for name in ("sums", "branching"))
         return BaselineState(BaselineCells.of(box), sums, branching)

@@ -24,8 +24,8 @@ from pathreplay.transport.vertex import TraceConfig
 def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """Return whether only emitted radiance has gradients: no weight depends on a parameter, and nothing moves.
 
-    Tracing one step symbolically includes the virtual functions of all objects. If Dr.Jit evaluates virtual calls
-    immediately, the first vertices may miss some objects, and the result is False. It is also False with media.
+    One step is traced symbolically, which includes the virtual functions of all objects. With media, the result is
+    False. The result is also False if Dr.Jit evaluates virtual calls, because the first vertices may miss some objects.
     """
     if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False

@@ -116,7 +116,7 @@ def length_scale(scene: mi.Scene) -> float:
 
 
 def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
-    """Differentiate weight·e, at constant weight, with respect to the two fields of `Slope`."""
+    """Differentiate weight·e, at constant weight, with respect to the inputs of `Slope`; e is emission at ``at``."""
     if not has_smooth_lobes(trace):
         return Slope(mi.Float(0), mi.Float(0))
     slopes = []
@@ -145,8 +145,9 @@ def local_terms(
 ) -> tuple[mi.Float, mi.Spectrum, list[mi.Float]]:
     """Evaluate the step at ``v`` with a differentiable arrival; return three terms that both passes differentiate.
 
-    The first term is δL·β_i e_i + (slope of e_{i+1})·(pdf, slide). The second is w_i/detach(w_i), or 0 where w_i is 0.
-    The third consists of the four coordinates of the next ray. ``weight`` is δL β_i; ``slope`` is the slope of e_{i+1}.
+    The first term is δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), with the inputs pdf and slide of `Slope`. The second
+    is w_i/detach(w_i), or 0 where w_i is 0. The third consists of the four coordinates of the next ray. ``weight`` is
+    δL β_i; ``slope`` is the slope of e_{i+1}.
     """
     step = repeat_step(trace, replace(v, at=at), True, active)
     o, d = step.ray_next.o, step.ray_next.d

@@ -58,11 +58,11 @@ def largest_record(trace: TraceConfig) -> int:
 
 def _bytes(layout: Layout) -> int:
     kinds = [_plain(kind) for _, kind, remembered in FIELDS if getattr(layout, remembered)]
-    return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # plus the word of bits
+    return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # 4 for the word of bits
 
 
 def room_for(trace: TraceConfig) -> int:
-    """Return the number of records per path. With media, it includes two null boundaries per vertex (convex media)."""
+    """Return the number of records per path. With media, two null boundaries per vertex are assumed (convex media)."""
     if trace.media is None:
         return device_of(mi.variant()).room(max(trace.max_depth, 1))
     return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)
@@ -161,7 +161,7 @@ def _require_known(place: str, remembered: str) -> None:
         if name not in types:
             raise TypeError(f"{kind.__name__} has no '{name}': '{place}' cannot be recorded")
         kind = getattr(vertex, types[name], None)
-        if kind is None:  # the remaining names belong to a class of Mitsuba or Dr.Jit
+        if kind is None:  # a class of Mitsuba or Dr.Jit, whose fields are not checked
             break
     if remembered not in {each.name for each in fields(Layout)} | {"varies"}:
         raise TypeError(f"Layout has no '{remembered}', on which '{place}' depends")

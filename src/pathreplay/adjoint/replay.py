@@ -41,7 +41,7 @@ def replay(
     differentiated: visibility, weights that are exactly zero (in contrast to the sweep driver) and, with
     ``attach='none'``, all motion. Raises PathreplayError if a path moves in a scene with media.
     """
-    # With null branching, zero weights do not end paths, as in the other drivers: the branch gets the same samples.
+    # With null branching, zero weights do not end paths. The branch then has the same samples as in other drivers.
     path = PathState.begin(trace, start, sustained=trace.branch)
     moves = path_moves(trace, start, path.at)
     if not moves:

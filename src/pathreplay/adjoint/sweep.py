@@ -56,6 +56,6 @@ def sweep(
     with dr.resume_grad():
         o, d = start.repeat()
         if moves and dr.grad_enabled(o, d):
-            dr.eval(q)  # once: otherwise, the sum over q for each camera parameter runs the loops
+            dr.eval(q)  # otherwise, the sum over q for each camera parameter would repeat the loops
             backward(dr.dot(q.o, o) + dr.dot(q.d, d))
     return moves

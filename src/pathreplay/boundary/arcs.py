@@ -27,7 +27,7 @@ from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
 
 UNIFORM = 0.25
-"""Fraction of arcs through uniform directions: BSDF samples rarely cover weak lobes or start below the horizon."""
+"""Fraction of arcs through uniformly sampled directions. BSDF samples are rare in weak lobes and below the horizon."""
 LENGTHS = 3
 """Number of arc lengths; each is a quarter of the previous one."""
 BROAD = 256.0

@@ -28,7 +28,7 @@ from pathreplay.transport.volume.passage import SHORT_OF, transmittance_up_to
 MAX_CHAIN = 16
 """Largest number of vertices in a chain of delta lobes."""
 NEVER = 0xFFFFFFFF
-"""Depth of Russian roulette that no path reaches."""
+"""Value of ``rr_depth`` that turns Russian roulette off."""
 
 
 def chain_config(trace: TraceConfig) -> TraceConfig:
@@ -45,8 +45,8 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
 def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> VisibilityProbe:
     """Probe a path from the camera to its first vertex without a delta lobe.
 
-    Vertices before the first surface that may move are ignored. Where ``flows``, all surfaces may move relative to the
-    film position.
+    Vertices before the first surface that may move are ignored. Where ``flows`` (see `FilmDomain`), the camera ray
+    may move, and all surfaces count as moving.
     """
     sampler = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
@@ -153,9 +153,10 @@ def split_chains(trace: TraceConfig, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UI
 def record_chain(
     trace: TraceConfig, s: mi.Point2f, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, at: mi.Ray3f, active: mi.Bool
 ) -> tuple[EdgePath, mi.Bool]:
-    """Record the first ``k`` vertices of the chain along ``ray``. The ray ``at`` leads from the last one to an edge.
+    """Record the first ``k`` vertices of the chain along ``ray``.
 
-    Returns the recorded path, and the lanes in which the chain has ``k`` vertices and a next arrival.
+    The ray ``at`` leads from the last of these vertices to an edge. Returns the recorded path, and the lanes in which
+    the chain has ``k`` vertices and a next arrival.
     """
     layout = Layout.of(trace, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)

@@ -1,4 +1,4 @@
-"""Edges that are not outlines: contacts of two surfaces, dark limits of smooth shading, and hard shadow boundaries.
+"""Edges other than outlines: surface contacts, hard shadow boundaries, lines where smooth shading turns black.
 
 A smooth-shaded mesh turns black where its shading normal is perpendicular to the ray, slightly before its outline.
 """
@@ -20,10 +20,10 @@ from pathreplay.transport.vertex import Arrival, TraceConfig
 MEETS = 1e-3
 """Largest relative difference of distances at which two surfaces are considered in contact."""
 ASIDE = 2.0
-"""Distance from the contact line of two surfaces to which hits are moved. The unit is the distance at which offset ray
-origins just lie in front of both surfaces."""
+"""Distance from the contact line of two surfaces to which `off_contact` moves hits. The unit is the distance at which
+offset ray origins just lie in front of both surfaces."""
 STEEPEST = 8.0
-"""Largest assumed cotangent of half the angle between two surfaces. The distance above suffices down to 14 degrees."""
+"""Bound on the cotangent of half the angle between two surfaces. `ASIDE` suffices for angles of at least 14 degrees."""
 
 Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
 """A hit and its ray."""

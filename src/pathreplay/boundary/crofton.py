@@ -78,8 +78,9 @@ class VisibilityProbe:
     def _crease(self, other: VisibilityProbe) -> mi.Bool:
         """Return whether the probes see different triangles, and a sampled direction lies between their planes.
 
-        Only one of the triangles occludes such a direction. Directions close to a plane count as well: from the probe
-        to the crease, they turn with the shading normal, by at most the angle between the triangles.
+        Only one of the triangles occludes such a direction. Directions close to a plane count as well, because sampled
+        directions turn with the shading normal between the probe and the crease. They turn by at most the angle between
+        the triangles.
         """
         between = mi.Bool(False)
         for d in (self.light, self.lobe, other.light, other.lobe):
@@ -141,7 +142,7 @@ class Bracket:
 
 
 def crossing_weight(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi.Spectrum:
-    """Return K = jump · sgn(w·∂B) / |∂B|, with ∂B = ``slope`` and the jump in direction ``w``; 0 if not finite."""
+    """Return K = jump · sgn(w·∂B) / |∂B|, where ∂B is ``slope`` and w the direction of the jump; 0 if not finite."""
     n = dr.norm(slope)
     K = jump * (dr.sign(dr.dot(w, slope)) / n)
     return dr.select((n > 0) & dr.all(dr.isfinite(K)), K, 0)

@@ -1,13 +1,14 @@
 """Edges: derivatives due to the motion of edges, propagated along the camera paths that see the edges.
 
-An edge is the zero set of a function B(ray, π), and moves with dB/dπ. The contribution of the edge to the derivative of
-the radiance at film position s is
+An edge is the zero set of a function B(ray, π) of a ray and the parameters π, and moves with dB/dπ. The contribution of
+the edge to the derivative of the radiance at film position s is
 
     - Σ K dB/dπ,
 
-summed over the crossings of boundary segments with the edge. A lane has one crossing in `primary` and `volumetric`, and
-up to three in `secondary`. Reverse mode propagates the adjoint of the ray that sees the edge back along the records of
-the path. Forward mode propagates the tangent of the camera ray to the edge.
+summed over the crossings of boundary segments with the edge. K is the weight of a crossing (`Crossing.weight`). A lane
+has one crossing in `primary` and `volumetric`, and up to three in `secondary`. Reverse mode propagates the adjoint of
+the ray that sees the edge back along the records of the path. Forward mode propagates the tangent of the camera ray to
+the edge.
 """
 
 from __future__ import annotations
@@ -50,7 +51,10 @@ class FilmDomain(Protocol):
         """
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
-        """Return whether static surfaces may move relative to a film position."""
+        """Return whether the camera ray through a film position may move under the film flow.
+
+        If the ray moves, the edges of static surfaces move relative to the ray.
+        """
 
     def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
         """Project a point onto the film: return its position, and whether the projection exists and is supported."""

@@ -7,7 +7,8 @@ Segments lie in a unit square. For most emitters this is the square of their ran
 - The samples of a mesh are discontinuous where they change from one triangle to the next. The square is therefore
   mapped to the cone of directions around a bounding sphere of the mesh.
 
-Both maps are uniform. With and without the maps, a direction follows the same emitter point when the scene moves.
+Both maps are uniform. The maps do not change the motion of directions: when the scene moves, a direction follows its
+sampled point on the emitter, as in the interior term.
 """
 
 from __future__ import annotations
@@ -163,7 +164,7 @@ class EmitterSegment(PlaneSegment):
         ray = dr.select(in_cone, observer.origin.spawn_ray(d), ray)
         tested |= in_cone
         first = observer.hit(ray, tested)
-        # The emitter itself is a hit, even if its surface transmits light.
+        # `behind` skips null boundaries, but must not skip the emitter's own surface.
         on_emitter = in_cone & first.is_valid() & (first.shape.emitter() == emitter.ptr)
         hit = dr.select(on_emitter, first, observer.behind(ray, first, tested & ~on_emitter))
         seen = in_cone & hit.is_valid() & (hit.shape.emitter() == emitter.ptr)
@@ -202,7 +203,7 @@ class EmitterSegment(PlaneSegment):
         return VisibilityProbe.of(sample.hidden & moving)
 
     def detect(self) -> Importance:
-        """Estimate the importance of an edge. Without narrow lobes, only the segment's middle evaluates scattering."""
+        """Estimate the importance of an edge. Without narrow lobes, scattering is evaluated only in the middle."""
         trace, x, active = self.observer.trace, self.observer.selected, self.observer.active
         samples = [self.probe_emitter(t, active) for t in probe_positions(self.length)]
         a, b, c = (sample.light.d for sample in samples)
@@ -231,7 +232,7 @@ class EmitterSegment(PlaneSegment):
         a, b = (self.probe_emitter(t, active) for t in (bracket.a, bracket.b))
         active &= a.hidden != b.hidden
         lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
-        active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)  # not the mesh emitter's own outline
+        active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)  # excludes the outline of a mesh emitter
         active &= observer.is_far(dark.hit.t)
         f, pdf = observer.towards(lit.light.d, active)
         T = observer.transmittance_past_edge(lit.light, dark.hit.t, self.key, active)
@@ -239,7 +240,7 @@ class EmitterSegment(PlaneSegment):
         jump *= bracket.per_length(self.length, mi.Float(INSIDE**-2)) * dr.select(a.hidden, -1, 1)
         active &= dr.any(jump != 0) & dr.all(dr.isfinite(jump))
         u, u_lit = (self.at(dr.select(a.hidden, *t)) for t in ((bracket.a, bracket.b), (bracket.b, bracket.a)))
-        own = active & observer.separates(lit.light.d, dark.light.d)  # not ray.d: ray origins are offset
+        own = active & observer.separates(lit.light.d, dark.light.d)  # not ray.d, because ray origins are offset
         n = edge_normal(dark.hit, dark.ray, active)
         crossing = ShadowCrossing(jump, self, u, lit, dark, n, own, active)
         return crossing.weighted(self.direction(bracket.a), u_lit)
@@ -267,7 +268,7 @@ class ShadowCrossing:
         return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, dark.hit, dark.ray, self.active))
 
     def weighted(self, w: mi.Vector2f, u_lit: mi.Point2f) -> ShadowCrossing:
-        """Replace the weight, the jump along ``w``, by its `crossing_weight`. ``u_lit`` is the end on the lit side."""
+        """Replace the weight (the jump along ``w``) by the `crossing_weight`; ``u_lit`` is the end on the lit side."""
         observer, dark = self.segment.observer, self.dark
         at = observer.moved(observer.at.ray)
         slope = derivative_by_place(self.u, lambda u: self._gap(at, u))

@@ -33,7 +33,7 @@ class ShadowTest:
 
     @staticmethod
     def of(trace: TraceConfig, at: Arrival, sampler: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
-        """Test whether the light sampled at a path's k-th vertex reaches this vertex, to which ``sampler`` is set."""
+        """Test whether a path's k-th vertex receives light from its emitter sample; ``sampler`` is at this vertex."""
         u = VertexSamples.draw(sampler).light
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
         test = ShadowTest.at(trace, si, u, _scatters(trace, si, k, active))
@@ -42,7 +42,7 @@ class ShadowTest:
 
     @staticmethod
     def at(trace: TraceConfig, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> ShadowTest:
-        """Test whether the light that ``u`` selects reaches ``x``. With media, projectors and spots have no limits."""
+        """Test whether the light that ``u`` selects reaches ``x``. With media, only occlusion is tested."""
         light, Le = draw_emitter(trace.scene, x, u, active, visible=False)
         valid = active & (light.pdf != 0)
         lit, ray = valid & light.delta, x.spawn_ray_to(light.p)

@@ -60,13 +60,13 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
 
 
 def radiance_of(importances: list[Importance]) -> mi.Float:
-    """Estimate the mean radiance along arcs: all scattered emitter light, divided by the arcs' scattering weights."""
+    """Estimate the mean radiance along arcs: total scattered emitter light over total scattering weight of the arcs."""
     from_emitters, total = (dr.sum(importance.light) for importance in importances)
     return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
 
 
 def weighed(importances: list[Importance], radiance: mi.Float) -> list[mi.Float]:
-    """Return presence and importance of edges, first for segments in squares, then for arcs; each sums to 1."""
+    """Return two arrays, presence and importance of edges. Each has sum 1; segments in squares precede arcs."""
     in_squares, on_arcs = importances
     presence = dr.concat([in_squares.presence, on_arcs.presence])
     importance = dr.concat([in_squares.edges, radiance * on_arcs.edges])

@@ -64,8 +64,9 @@ def choose_vertex(
 ) -> tuple[Any, SelectedVertex]:
     """Trace a camera path, and select one of its smoothly scattering vertices in proportion to the throughput.
 
-    Where ``flows``, all vertices may move relative to the film position. Vertices are written to ``records`` unless
-    ``records`` is None. The last vertex that ``trace`` allows scatters no light, and is therefore not traced.
+    Where ``flows`` (see `FilmDomain`), the camera ray may move, and all vertices count as moving. Vertices are written
+    to ``records`` unless ``records`` is None. The last vertex that ``trace`` allows scatters no light, and is therefore
+    not traced.
     """
     trace = replace(trace, max_depth=max(trace.max_depth - 1, 0))
     path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)))
@@ -122,7 +123,7 @@ class ObserverVertex:
             # With a given flight, no random numbers are needed, and the sampler may be None.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # fixed directions slide over facets
+        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # fixed directions can cross creases
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
         """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium: see `fly_again`."""
@@ -216,7 +217,7 @@ class ObserverVertex:
     def medium(self, d: mi.Vector3f) -> mi.MediumPtr:
         """Return the medium in direction ``d``; None in scenes without media."""
         if self.trace.media is None:
-            return None  # as in `Arrival`
+            return None  # like `Arrival.medium`
         turns = self.vertex.surface & self.si.is_medium_transition()
         return dr.select(turns, self.si.target_medium(d), self.at.medium)
 

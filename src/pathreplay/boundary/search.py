@@ -48,12 +48,12 @@ class EdgeSearch(ABC, Generic[Segments]):
         search = self.guided(n, seed)
         importance = search.detect(search.draw(dr.arange(mi.UInt32, n), n, seed))
         chosen = Resampled.of(importance, resolved, seed)
-        weight = chosen.weight * dr.opaque(mi.Float, 1 / n)  # opaque: one kernel for all values of n
+        weight = chosen.weight * dr.opaque(mi.Float, 1 / n)  # an opaque n gives one kernel for all values
         generator = mi.PCG32(resolved, initstate=seed + int(self.bisection), initseq=dr.arange(mi.UInt32, resolved))
         return search.resolve(search.draw(chosen.index, n, seed), weight, generator)
 
     def guided(self, n: int, seed: mi.UInt32) -> EdgeSearch[Segments]:
-        """Return a search whose density a pilot pass has refined; without a pilot pass, the same search."""
+        """Return a search whose density a pilot pass has refined; without a pilot pass, this search."""
         return self
 
     @abstractmethod

@@ -3,7 +3,7 @@
 At a scattering vertex x, light arrives from a direction ω. When parameters change, the interior term moves ω with a
 velocity V. An emitter sample keeps its random numbers u. Any other sample follows its hit point, to the degree φ (see
 `velocity`). In narrow lobes, a sample keeps its direction instead (see `keeps_direction`). At an edge, the integrand
-jumps from f_near to f_far. The boundary term contains the motion of the edge relative to V:
+jumps from f_near to f_far. The boundary term of the scattered radiance J contains the motion of the edge relative to V:
 
     dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
 
@@ -35,12 +35,13 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport.vertex import TraceConfig
 
 UNGUIDED = 0.8
-"""Fraction of segments drawn from the previous density, because reflections and refractions also show shadows."""
+"""Fraction of pilot segments that are not concentrated at cast shadows, because shadows seen in reflections and
+refractions lie at other film positions."""
 
 
 @dataclass
 class CameraPath:
-    """A camera path to a vertex with two segments: one in the unit square of emitter samples, and one arc."""
+    """A camera path to a vertex, which has two segments: one in the unit square of emitter samples, and one arc."""
 
     s: mi.Point2f  # film position
     density: mi.Float  # of s, per pixel

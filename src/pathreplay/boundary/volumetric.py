@@ -1,13 +1,14 @@
 """Volumetric boundary term: boundaries of the hard shadows that lights without extent cast into media.
 
 The camera sees points x = o + τ d of a medium at all distances τ. Each x is either lit or in shadow. For each τ, the
-film therefore has an edge, which short segments with constant τ find (see `crofton`), as for hard shadows on surfaces:
+boundary of the shadow is an edge on the film. Short segments with constant τ find this edge (see `crofton`):
 
     dI/dπ = - Σ K dB/dπ,    K = π/2 · f / (l p(c) p(τ) N) · sgn(w·∂B/∂s) / |∂B/∂s|,    B = n·(x + r d - z),
 
 where f is the radiance that the lit side scatters to the camera, including the transmittances from the light to x and
-from x to the camera. In dB/dπ, x moves as in the interior term. ∂B/∂s is taken at constant τ, because the domain of the
-integral consists of film positions and distances.
+from x to the camera, and N is the number of segments. `primary` defines the symbols of B, for hard shadows on surfaces.
+In dB/dπ, x moves as in the interior term. ∂B/∂s is taken at constant τ, because the domain of the integral consists of
+film positions and distances.
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Return the sensors that count as static. If the pass has no film flow, its sensor is excluded."""
+    """Return the sensors that count as static. Without film flow, the sensor of the pass does not count as static."""
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 
 

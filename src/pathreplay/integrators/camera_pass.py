@@ -85,7 +85,7 @@ class Pass:
     spp: int = 0
     share: float = 1.0  # weight in the mean over the parts of a split pass: see `parts`
     uses_sobol: bool = False
-    flow: FilmFlow | None = None  # motion of film positions; rays carry only motion that the flow does not contain
+    flow: FilmFlow | None = None  # motion of film positions; derivatives of rays then contain only the remaining motion
 
     @staticmethod
     def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, uses_sobol: bool = False) -> Pass:

@@ -292,9 +292,9 @@ class PathReplayIntegrator(PathIntegrator):
         return self.baseline[1]
 
     def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:
-        """Log doubts about the gradient, and return the control variate, if the pass may use it.
+        """Log doubts about the gradient. Return the control variate, or None if the pass has none or may not use it.
 
-        A pass never uses a control variate that it contributed to, because this would bias its gradient.
+        A pass never uses a control variate to which it has contributed, because the gradient would be biased.
         """
         for doubt in filter(None, (*doubts(trace), *(term.note(trace) for term in self.terms))):
             self._warn_once(doubt)

@@ -42,7 +42,7 @@ class _Entry(Generic[T]):
 
     scene: mi.Scene
     about: T
-    held_once: object = field(default_factory=object)  # for comparison: an object that only this entry references
+    held_once: object = field(default_factory=object)  # only this entry references this object: see `is_unreferenced`
 
     @property
     def is_unreferenced(self) -> bool:
@@ -134,7 +134,7 @@ def careful() -> Iterator[None]:
 
 
 def _acquire() -> bool:
-    """Try to acquire `_ONE_THREAD`; wait only while another thread runs `_on_collection`. Return whether it worked."""
+    """Try to acquire `_ONE_THREAD`; wait only while another thread runs `_on_collection`. Return True on success."""
     while not _ONE_THREAD.acquire(blocking=False):
         if not _AT_COLLECTION.locked():
             return _ONE_THREAD.acquire(blocking=False)

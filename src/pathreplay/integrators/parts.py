@@ -99,7 +99,7 @@ def summed(scene: mi.Scene, passes: Sequence[Pass]) -> Iterator[Callable[[], Non
     try:
         yield (lambda: None) if sums is None else sums.take
     finally:
-        if sums is not None:  # also after an error: the sums include the gradients of earlier passes
+        if sums is not None:  # even after an error, because the sums include the gradients of earlier passes
             sums.give()
 
 

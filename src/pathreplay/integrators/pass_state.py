@@ -39,5 +39,5 @@ class PassState:
         return replace(self, result=self.result + replace(result, image=None))
 
     def to_record(self) -> PassState:
-        """Return the state without ``passes``, for a recorded pass, which cannot compare its own key with them."""
+        """Return the state without ``passes``: a recorded pass cannot compare its own key with these keys."""
         return replace(self, passes=frozenset())

@@ -33,9 +33,9 @@ def whole_number(
     unbounded: bool = False,
     kind: str = "depth",
 ) -> int:
-    """Read an integer from ``lowest`` to `LARGEST`, or -1 if ``unbounded``; ``kind`` names it in errors.
+    """Read an integer from ``lowest`` to `LARGEST`; if ``unbounded``, -1 is valid as well.
 
-    Raises PathreplayError otherwise.
+    Raises PathreplayError for any other value; the message calls the value a ``kind``.
     """
     value = props.get(name, default)
     if type(value) is int and (lowest <= value <= LARGEST or (unbounded and value == -1)):

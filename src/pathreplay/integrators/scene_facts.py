@@ -57,7 +57,7 @@ class SceneFacts:
 
     @property
     def has_seams(self) -> bool:
-        """Whether a texture has discontinuities. A recording assumes that it has, unless an earlier pass checked."""
+        """Whether a texture has discontinuities. True in a recording, unless an earlier pass found no discontinuity."""
         if self._seams is None and not is_recording():
             self._seams = has_seams(self._textures)
         return self._seams is not False

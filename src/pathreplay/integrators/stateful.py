@@ -19,7 +19,7 @@ Learned = Mapping[str, np.ndarray]
 _RECORDABLE = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
 """Classes of Mitsuba's integrators that `dr.freeze` can record."""
 _PROJECTIVE = "Projective"
-"""Substring that identifies Mitsuba's integrators with boundary terms by their class names."""
+"""Substring in the class names of Mitsuba's integrators that estimate boundary terms."""
 
 
 @runtime_checkable
@@ -28,7 +28,7 @@ class StatefulIntegrator(Protocol):
 
     @property
     def boundary(self) -> str:
-        """The estimated boundary terms, as in the property ``boundary`` of `pathreplay`."""
+        """Boundary terms that the integrator estimates: a value of the property ``boundary`` of `pathreplay`."""
 
     @property
     def warned(self) -> Collection[str]:
@@ -67,7 +67,7 @@ class StatefulIntegrator(Protocol):
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None: ...
 
     def options(self) -> Json:
-        """Return the properties for an equivalent `pathreplay`, except the ones that all path integrators share."""
+        """Return the properties of an equivalent `pathreplay`, except the ones that all path integrators share."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Stateless:
         return self.name in _RECORDABLE and not has_media
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
-        """Return True, because the answer is unknown."""
+        """Return True, because Mitsuba's integrators do not tell whether a parameter reaches the paths."""
         return True
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
@@ -116,7 +116,7 @@ class Stateless:
             return mi.render(view.scene, sensor=view.sensor, integrator=self.integrator, spp=view.spp, seed=view.seed)
 
     def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState:
-        with dr.isolate_grad():  # for the same reason as in `PathIntegrator.gradient_pass`
+        with dr.isolate_grad():  # preserves the AD graph of scene values for the next pass
             params = mi.traverse(view.scene)
             self.integrator.render_backward(view.scene, params, grad_in, view.sensor, view.seed, view.spp)
         return state

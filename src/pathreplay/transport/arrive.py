@@ -97,7 +97,7 @@ def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
 
 
 def sees_lights(trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Return the lanes in which emission counts. ``hide_emitters`` excludes camera rays that leave the scene."""
+    """Return the lanes whose ray sees emitters. With ``hide_emitters``, camera rays that leave the scene see none."""
     return active & (~at.camera | si.is_valid()) if trace.hide_emitters else active
 
 

@@ -29,7 +29,7 @@ class Connection:
         return dr.select(self.light.delta, 1, mis_weight(self.light.pdf, pdf))
 
     def reaches(self, pdf: mi.Float, attached: bool) -> mi.Spectrum:
-        """Return the MIS-weighted radiance that reaches the vertex (Spectrum); for ``pdf`` see `mis`."""
+        """Return the MIS-weighted radiance of the sample that reaches the vertex (Spectrum); for ``pdf`` see `mis`."""
         mis = self.mis(pdf)
         # The MIS weights of a detached path need no derivative: they sum to one for all values of the parameters.
         return self.Le * (mis if attached else dr.detach(mis))

@@ -81,7 +81,7 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        # For edges, rough lobes are skipped: with attach = 'delta', they are attached only in scenes without outlines.
+        # `edges_move` ignores attached rough lobes: with attach = 'delta', they occur only in scenes without outlines.
         for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
             moving.append(sample.wo)
@@ -93,8 +93,9 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
 def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
     """Return whether the weight of a continuation on a surface depends on parameters with gradients.
 
-    The result is valid only if the paths do not move. ``at`` is the first arrival. The function traces the weight of an
-    arbitrary lobe, as later passes do, and inspects whether this weight has gradients. Nothing is evaluated.
+    The result is valid only if the paths do not move. ``at`` is the first arrival. As later passes do, the function
+    traces the weight of a lobe that is unknown at trace time. It then inspects whether this weight has gradients.
+    Nothing is evaluated.
     """
     lobe, valid = at.hit.prim_index, at.hit.is_valid()  # values unknown at trace time
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, valid)

@@ -79,7 +79,7 @@ def choose(
 def _in_medium(
     v: Vertex, at: Arrival, u: VertexSamples, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool, surface: Sampled
 ) -> Sampled:
-    """Replace the sample of a ``surface`` in lanes whose vertex is a collision in a medium or a null boundary."""
+    """Replace the sample at collisions by a phase function sample, and at null boundaries by straight transmission."""
     event, through, phase, ctx = v.inside.event, v.inside.through, v.inside.phase, mi.PhaseFunctionContext(None)
     f, pdf_light = phase.eval_pdf(ctx, v.inside.mei, d, lit & event)
     wo, w, pdf = phase.sample(ctx, v.inside.mei, u.lobe, u.direction, go_on & event)
@@ -179,7 +179,7 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
 def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
     """Return the lanes whose hit surface passes part of the light unscattered. These lanes have a fixed direction.
 
-    A direction that followed the motion of such a surface would move across the surfaces behind, and across their
+    A direction that followed the motion of such a surface would move across the surfaces behind it and across their
     edges. With a fixed direction, the outline of the transparent surface needs a boundary term. All lanes are therefore
     False unless boundary terms are estimated.
     """
@@ -189,7 +189,7 @@ def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi
 
 
 def _followed(trace: TraceConfig, v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
-    """Return the lanes whose smooth lobe is sampled attached; independent of the direction within the lobe."""
+    """Return the lanes whose smooth lobe is sampled attached. The direction within the lobe does not matter."""
     if not trace.follows:
         return mi.Bool(False)
     index = dr.reinterpret_array(mi.UInt32, v.bsdf)
@@ -240,8 +240,8 @@ def _at_particle(
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
     """Evaluate weight, direction and density of the continuation from a collision in a medium again.
 
-    If the next surface scatters or emits, the direction points to the hit point, which moves with the surface: such a
-    surface may have texture seams and edges. On other surfaces the direction is constant, because this is less noisy.
+    If the next surface scatters or emits light, the direction follows the hit point, because such a surface may have
+    edges and texture seams. Towards any other surface, the direction is constant, which is less noisy.
     """
     kept, hit_next = again.kept, again.hit_next
     d, J = kept.d, mi.Float(1)

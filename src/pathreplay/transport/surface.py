@@ -73,8 +73,9 @@ class SurfacePoint:
 def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> SurfacePoint:
     """Return the point that ``ray`` hit, with fixed surface coordinates.
 
-    On meshes, the area vector A is the cross product of two sides of the triangle. The derivatives of the position with
-    respect to texture coordinates would be zero for degenerate texture coordinates, and would depend on their motion.
+    On meshes, the area vector A is the cross product of two sides of the triangle. Derivatives of the position with
+    respect to texture coordinates are unsuitable: they vanish if the coordinates are degenerate, and depend on any
+    motion of the coordinates.
     """
     flags = mi.RayFlags.FollowShape
     on_mesh = active & hit.shape.is_mesh()

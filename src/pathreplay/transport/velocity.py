@@ -16,8 +16,8 @@ two surfaces touch. The field used here is therefore the blend V = φ V_H, with 
 
 In the second equation, only r depends on d: all directions that hit the plane have the same h. The factor r in m keeps
 V close to V_H at distant hit points on a near plane. Such points may lie on edges. The cost in variance is small,
-because few directions, at grazing angles, reach them. For a sphere, h is the distance from x to the sphere, which also
-does not depend on d and does not vanish at the silhouette. On other curved shapes, V = V_H.
+because few directions, at grazing angles, reach them. For a sphere, h is the distance from x to the sphere. This
+distance does not depend on d either, and does not vanish at the silhouette. On other curved shapes, V = V_H.
 """
 
 from __future__ import annotations

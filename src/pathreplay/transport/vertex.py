@@ -53,7 +53,7 @@ class TraceConfig:
 
     # Choices of the caller.
     skips_null: bool = False
-    """Whether rays skip null boundaries; ``media`` must be None. The search for edges uses this configuration."""
+    """Whether rays skip null boundaries, as in the search for edges. If True, ``media`` must be None."""
     steady_frames: bool = False
     """Whether `steady` replaces the shading frames of meshes."""
     background_apart: bool = False
@@ -141,7 +141,7 @@ class Flight:
 
     event: mi.Bool  # a real collision happened before any surface
     t: mi.Float  # distance to the real collision
-    density: mi.Float  # probability density p σ̄ of the real collision; 1 without one
+    density: mi.Float  # probability density p σ̄ of the real collision; 1 if there is no collision
     W: mi.Spectrum  # product of the weights of all null collisions on the flight; 1 in grey media
     along: mi.Float  # random offset in [0, 1) of the points at which the transmittance is differentiated
     p: mi.Float = None  # type: ignore[assignment]  # probability that the collision was real (None if no null collisions are kept)
@@ -207,7 +207,7 @@ class Lighting:
     """Inputs of `relight`, which evaluates the contribution e of a surface as a linear function of emitted radiance."""
 
     si: mi.SurfaceInteraction3f
-    seen: mi.Bool  # emission at the vertex counts
+    seen: mi.Bool  # e includes the emission at the vertex (false for hidden emitters)
     light: mi.DirectionSample3f  # the emitter sample
     w: mi.Spectrum  # weight of the sample's radiance: f / density, MIS weighted
     lit: mi.Bool  # the emitter sample is valid and unoccluded

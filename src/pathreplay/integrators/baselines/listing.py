@@ -51,7 +51,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
         u, step = path.choose(trace, sampler)
         kept = step.kept
 
-        # All radiance along the ray passed the null collisions of the flight, or was scattered at its real collision.
+        # All radiance along the ray passed the flight's null collisions and, if there is one, its real collision.
         differentiate_flight(path.at, kept.media.flight, past, path.active, δL * L)
         L -= path.β * step.e
 

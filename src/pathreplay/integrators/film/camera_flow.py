@@ -1,8 +1,8 @@
 """Film flow: the motion of a camera expressed as motion of film positions, which needs no boundary term.
 
-When a camera rotates, the same radiance arrives at other film positions. Let s be a film position, c(s, π) its camera
-ray, and T(s, π) the image of s under a chosen flow, with T(s, π₀) = s and the velocity v = ∂T/∂π. An integral over the
-film D with weights W does not depend on the parametrisation of the positions:
+When a camera rotates, the same radiance arrives at other film positions. Let π be the parameters, s a film
+position, c(s, π) its camera ray, and T(s, π) the image of s under a chosen flow, with T(s, π₀) = s and the velocity
+v = ∂T/∂π. An integral over the film D with weights W does not depend on the parametrisation of the positions:
 
     ∫ W(s) L(c(s, π)) ds = ∫ W(T) L(c(T, π)) |∂T/∂s| ds.
 
@@ -34,7 +34,8 @@ ONLY_POSITIONS = "x_fov", "principal_point_offset_x", "principal_point_offset_y"
 """Camera parameters that only move rays to other film positions. The film flow contains all motion of such rays."""
 OTHERS = "to_world", "focus_distance", "aperture_radius"
 STEP = 1 / 256
-"""Step of central differences, in film widths. The relative error is 4e-6 for a field of view of 40°, 1e-4 for 120°."""
+"""Step of central differences, in film widths. The derivatives have a relative error of 4e-6 for a field of view of
+40°, and of 1e-4 for 120°."""
 PROBES = 16
 """Number of probe rays per row and column of the film, which measure distances to the scene."""
 
@@ -70,7 +71,7 @@ class FilmFlow(Protocol):
 
     @property
     def samples(self) -> int:
-        """Number of samples of a pixel that `FilmMotion` replaces by one group of paths."""
+        """Number of samples per pixel for which `FilmMotion` traces one group of paths."""
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """Return the sensor's ray and its weight.
@@ -143,7 +144,7 @@ class CameraFlow:
         return mi.Bool(True)
 
     def leaves_rest_at(self, position: mi.Point2f) -> mi.Bool:
-        """Return `leaves_rest`, the same everywhere."""
+        """Return `leaves_rest`, which applies to all film positions."""
         return mi.Bool(self.leaves_rest)
 
     def carry_tangents(self) -> None:
@@ -156,7 +157,7 @@ class CameraFlow:
 
 
 def film_velocity(δp: mi.Vector3f, derivatives: RayDerivatives, t: mi.Float) -> mi.Vector2f:
-    """Return the film velocity of points at distance t on the rays, which move by δp, by least squares."""
+    """Return, by least squares, the film velocity of points that lie at distance t on the rays and move by δp."""
     x, y = (o_k + t * d_k for o_k, d_k in zip(*derivatives, strict=True))
     xx, xy, yy = dr.dot(x, x), dr.dot(x, y), dr.dot(y, y)
     a, b = dr.dot(x, δp), dr.dot(y, δp)

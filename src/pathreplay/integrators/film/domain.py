@@ -43,7 +43,7 @@ class FilmPlaces:
         return mi.Ray3f(ray), dr.detach(weight)
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
-        """Return whether static surfaces may move relative to a film position: see `FilmDomain`."""
+        """Return whether the camera ray through a film position may move under the film flow: see `FilmDomain`."""
         flow = self.view.flow
         return mi.Bool(False) if flow is None else flow.leaves_rest_at(self.in_sensor(s))
 
@@ -63,7 +63,7 @@ class FilmPlaces:
         return (self.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
 
     def undeveloped(self, grad_in: mi.TensorXf) -> mi.TensorXf:
-        """Return the adjoint g_j / ∫ h_j of each block pixel j, with the adjoint g of the image and the filters h_j."""
+        """Return g_j / ∫ h_j for each pixel j of a block; g_j is the adjoint of image pixel j, and h_j its filter."""
         with dr.resume_grad():
             pixels = mi.TensorXf(self._block().tensor())
             dr.enable_grad(pixels)
@@ -74,20 +74,24 @@ class FilmPlaces:
             return dr.grad(pixels)
 
     def importance(self, block_grad: mi.TensorXf, s: mi.Point2f, wavelengths: mi.Spectrum) -> mi.Spectrum:
-        """Return the adjoint W(s) = Σ_j g_j h_j(s) / ∫ h_j of radiance at film positions, zero outside the domain.
+        """Return the adjoint W of the radiance at film positions ``s``.
 
-        ``block_grad`` is the adjoint of a block: see `undeveloped`.
+        Inside the domain, W(s) = Σ_j g_j h_j(s) / ∫ h_j, where g_j is the adjoint of image pixel j, and h_j its filter.
+        Outside the domain, W is zero. ``block_grad`` contains g_j / ∫ h_j: see `undeveloped`.
         """
         inside = dr.all((s >= 0) & (s < self.size))
         return dr.select(inside, _splat_adjoint(lambda L: self._put(s, L, wavelengths), dr.width(s), block_grad), 0)
 
     def image(self, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
-        """Splat radiance ``L`` at film positions, and return the image. Each sample weighs as much as one pixel."""
+        """Splat radiance ``L`` at film positions ``s``, and return the image.
+
+        Pixel j is Σ L h_j(s) / ∫ h_j, with h_j the filter of the pixel: see `importance`.
+        """
         inside = dr.all((s >= 0) & (s < self.size))
         return self.developed(self._put(s, dr.select(inside, L, 0), wavelengths))
 
     def importance_of_pixels(self, block_grad: mi.TensorXf, pixel: mi.UInt32, wavelengths: mi.Spectrum) -> mi.Spectrum:
-        """Return the adjoint g_j / ∫ h_j of pixels by row-major index: see `importance`."""
+        """Return g_j / ∫ h_j (see `importance`) for the pixels j with these row-major indices."""
         return _splat_adjoint(lambda L: self.pixels(pixel, L, wavelengths), dr.width(pixel), block_grad)
 
     def pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
@@ -123,7 +127,7 @@ class FilmPlaces:
         return film.develop()
 
     def _filter_integral(self, block: mi.ImageBlock, index: mi.UInt32, axis: int) -> mi.Float:
-        """Return the integral of h_j over the domain along one axis, for pixels j given by their index on this axis."""
+        """Integrate a pixel's filter over the domain along one axis; ``index`` is the pixel's index on this axis."""
         rfilter = self.view.sensor.film().rfilter()
         if rfilter.is_box_filter():
             return mi.Float(1)

@@ -52,7 +52,7 @@ def adjoint(view: Pass, rays: Rays, grad_in: mi.TensorXf) -> mi.Spectrum:
         dr.enqueue(dr.ADMode.Backward, image)
         dr.traverse(dr.ADMode.Backward)
         δL = dr.grad(L)
-    view.sensor.film().clear()  # discard the radiance 1 that was splatted
+    view.sensor.film().clear()  # remove the unit radiance that `splat` has added
     return δL
 
 

@@ -108,7 +108,7 @@ class FilmMotion:
         return ""
 
     def _flow_factor(self, view: Pass, f: FlowPaths) -> mi.Float:
-        """Return one factor per path: the velocity along the axis of its pair, in pixels, or else the divergence."""
+        """Return one factor per path: for pairs, the velocity along the pair's axis, in pixels; else the divergence."""
         v = self.flow.velocity(f.sample) * mi.Vector2f(*view.size)
         return dr.select(f.single, self.flow.divergence(f.sample), dr.select(f.axis == 0, v.x, v.y))
 

@@ -1,6 +1,7 @@
 """Flow of a static camera: film positions follow the visible surfaces, so that surfaces move little under a pixel.
 
-A few probe rays sample the scene. A point p that a probe ray hits moves with its surface, and crosses the film at
+A few probe rays sample the scene. A point p that a probe ray hits moves with its surface. The image of p
+moves on the film with the velocity
 
     u = (∂(o + t d)/∂s)⁺ ∂p/∂π,
 
@@ -78,7 +79,7 @@ class SurfaceFlow:
             W = dr.select(visible, grazing + S, 0)
             u = film_velocity(si.p - dr.detach(si.p), derivatives, t) * grazing / (grazing + S)
             moves = visible & may_move(trace, hit)
-            dr.eval(u, W, moves)  # once, because every node gathers from these arrays
+            dr.eval(u, W, moves)  # evaluate once: every node gathers from these arrays
 
             index = dr.arange(mi.UInt32, NODES * NODES * PROBES * PROBES)
             node, i = index // (PROBES * PROBES), index % (PROBES * PROBES)
@@ -116,7 +117,7 @@ class SurfaceFlow:
         return dr.gather(mi.Bool, self.flows, _node(_cell_at(position)[0], 0, 0))
 
     def leaves_rest_at(self, position: mi.Point2f) -> mi.Bool:
-        """Return whether the film position may move: its ray then moves with it."""
+        """Return `moves_at`: the camera ray through a film position moves if the position moves."""
         return self.moves_at(position)
 
     def carry_tangents(self) -> None:

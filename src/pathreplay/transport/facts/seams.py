@@ -1,7 +1,7 @@
 """Textures with discontinuities: checkerboards, bitmaps with nearest-neighbour lookup, face attributes of meshes.
 
 Boundary terms do not cover these discontinuities. If such a texture exists, film positions must not follow moving
-surfaces, because static textures would then move relative to the film positions.
+surfaces: a camera ray that moves with its film position would cross the discontinuities of static textures.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 CHECKERBOARD, BITMAP, ATTRIBUTE = "Checkerboard", "BitmapTextureImpl", "MeshAttribute"
-"""Class names. BITMAP is the beginning of the class name of a bitmap, which ends with the texel type."""
+"""Class names. The class name of a bitmap begins with BITMAP and ends with the texel type."""
 PROBES, BESIDE = 64, 1e-3
 """Number of texel borders that are probed, and the distance of the probes from the borders, in texels."""
 WAVELENGTHS = 440.0, 510.0, 580.0, 650.0
@@ -23,7 +23,7 @@ difference between the two texels."""
 
 
 def has_seams(textures: Iterable[mi.Texture]) -> bool:
-    """Return whether one of the textures is discontinuous. Bitmaps, which do not expose their filter, are evaluated."""
+    """Return whether one of the textures is discontinuous. Bitmaps do not expose their filter, but can be evaluated."""
     return any(map(_jumps, textures))
 
 
@@ -48,7 +48,7 @@ def _is_nearest(texture: mi.Texture) -> bool:
     from_texels = np.linalg.inv(np.array(params["to_uv"].matrix, np.float64))
 
     def differences(beside: float) -> np.ndarray:
-        """Return the differences between values ``beside`` texels before and after a texel border."""
+        """Return the difference between the values on both sides of each border, ``beside`` texels from the border."""
         sides = []
         for side in (-1, 1):
             at = (border + side * beside) / along, middle

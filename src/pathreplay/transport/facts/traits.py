@@ -18,8 +18,8 @@ from pathreplay.transport.facts.seams import CHECKERBOARD
 from pathreplay.transport.facts.smoothing_groups import mesh_smoothing_groups
 from pathreplay.transport.velocity import blend_length
 
-# Class names identify BSDFs, because Mitsuba's objects do not expose these properties. ATTACHABLE BSDFs sample a
-# direction that is a smooth function of the random numbers, and choose a lobe independently of all parameters.
+# BSDFs are identified by class name, because Mitsuba does not expose the properties that matter here. ATTACHABLE BSDFs
+# sample a direction that is a smooth function of the random numbers, and choose a lobe independently of all parameters.
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 RELIEFS = frozenset({"NormalMap", "BumpMap"})
@@ -44,8 +44,8 @@ A = TypeVar("A", bound="dr.ArrayBase")
 class Tables:
     """Facts about BSDFs and shapes by registry index, as arrays for lookup in kernels.
 
-    A frozen function receives the tables as input or from the integrator. If neither has tables, they are created while
-    `dr.freeze` records (see `_array`).
+    A frozen function receives the tables as input or from the integrator. If both sources lack the tables, the tables
+    are created while `dr.freeze` records (see `_array`).
     """
 
     attachable: mi.Bool | None  # by BSDF: its smooth lobes may be sampled attached (None: for no BSDF)
@@ -261,9 +261,9 @@ def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
-    """Return whether no surface point sees an edge: the only shape in the scene does not see an edge of itself.
+    """Return whether no edge is visible from a surface point: the scene has one shape, which does not see its edges.
 
-    A flat shape does not see itself. The inside of a sphere sees itself, but no edge, unless a texture has a seam.
+    A flat shape does not see itself. A sphere sees itself from the inside, but has no edge unless a texture has a seam.
     """
     if len(shapes) != 1 or shapes[0].is_emitter():
         return False

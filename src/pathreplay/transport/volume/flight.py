@@ -168,9 +168,9 @@ def fly_again(
 
         (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the second term only if there is a collision)
 
-    is, up to sign, the score of the sampling density with both terms multiplied by b. Its mean is zero. Without the
-    control variate, the variance is high where the radiance is large and its derivative with respect to the medium is
-    small.
+    has mean zero, because both terms have the same expectation. For b = 1, it is the score of the sampling density, up
+    to sign. Without the control variate, the variance is high where the radiance is large and the derivative of the
+    radiance with respect to the medium is small.
     """
     medium, ray = at.medium, at.ray
     in_medium = active & (medium != None)  # noqa: E711

@@ -45,8 +45,8 @@ def scene_media(
 ) -> Media | None:
     """Collect the facts about the media of a scene, or return None without media.
 
-    ``passes`` is a field of `Media`. A medium that contains ``sensor`` becomes the field ``around``. ``branches`` is
-    the result of `wants_branch`, if this result is already known.
+    ``passes`` becomes the field of that name, and the medium that contains ``sensor`` the field ``around``.
+    ``branches`` is the result of `wants_branch`, if this result is already known.
     """
     if not media:
         return None

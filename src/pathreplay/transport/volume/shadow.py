@@ -153,7 +153,7 @@ def _boundary(trace: TraceConfig, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, s
     probe.maxt = still.maxt - y if sign > 0 else y
     hit = meet(trace, probe, active)
     met = active & hit.is_valid()
-    # The attached ray also starts at y: on a sphere, Mitsuba computes the interaction at the first hit of this ray.
+    # The attached ray must start at y, too: on a sphere, Mitsuba computes the hit again, as the ray's first hit.
     probe.o, probe.d = ray.o + y * ray.d, sign * ray.d
     si = hit.compute_surface_interaction(probe, mi.RayFlags.All, met)
     return dr.select(met, dr.replace_grad(y + sign * hit.t, y + sign * si.t), ray.maxt if sign > 0 else 0)
