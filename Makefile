@@ -8,13 +8,14 @@ READY := $(VENV)/.ready
 PYTEST := -q --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-hours lint bench clean
+.PHONY: help demo test test-all test-hours coverage lint bench clean
 
 help:
 	@echo "make demo      recover a texture, two wall colours and a light from rendered pictures, write a report"
 	@echo "make test      lint and the quick tests, with kernels that LLVM does not optimise"
 	@echo "make test-all  lint and every test but those that take hours, with kernels as users have them"
 	@echo "make test-hours  those: tails of all cells in 256 passes each, 300 random scenes in one process"
+	@echo "make coverage  lines of the package that the quick tests run"
 	@echo "make lint      ruff and mypy"
 	@echo "make bench     time, memory and variance next to Mitsuba's own integrators"
 	@echo "make clean     remove .venv and caches, keep runs/"
@@ -56,6 +57,9 @@ test-all: lint
 
 test-hours: lint
 	$(BIN)/python -m pytest $(PYTEST) -m hours
+
+coverage: $(READY)
+	PATHREPLAY_TEST_KERNELS=unoptimised $(BIN)/python -m pytest $(PYTEST) -m "not slow and not hours" --cov
 
 # TASKS='surface --quick' and the like: see benchmarks/__main__.py; without it all of them, in full.
 bench: $(READY)
