@@ -225,7 +225,7 @@ class EmitterSegment(PlaneSegment):
         return dr.select(sample.light.delta, 1, mis_weight(sample.density / self.inv_probability, pdf))
 
     def resolve(self, weight: mi.Float, generator: mi.PCG32) -> ShadowCrossing:
-        """Bisect the segment, and weigh the edge: see `EdgeSearch.resolve`."""
+        """Locate the edge by bisection, and compute its weight: see `EdgeSearch.resolve`."""
         observer = self.observer
         bracket = bisect(self.probe, self.length, dr.select(observer.active, weight, 0), generator)
         active = bracket.weight > 0

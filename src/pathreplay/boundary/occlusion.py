@@ -97,7 +97,7 @@ class ArcSegment(Arc):
         return Importance.of(survey, light, light * own_plane(self.observer, self.at(a), self.at(b)) / self.longest)
 
     def resolve(self, weight: mi.Float, generator: mi.PCG32) -> list[Crossing]:
-        """Bisect the arc, and weigh both sides of the edge: see `EdgeSearch.resolve`."""
+        """Locate the edge by bisection, and compute the weights of both of its sides: see `EdgeSearch.resolve`."""
         observer, trace = self.observer, self.observer.trace
         bracket = bisect(self.probe, self.length, dr.select(self.active, weight, 0), generator)
         active = bracket.weight > 0

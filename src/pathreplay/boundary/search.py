@@ -66,7 +66,7 @@ class EdgeSearch(ABC, Generic[Segments]):
 
     @abstractmethod
     def resolve(self, segments: Segments, weight: mi.Float, generator: mi.PCG32) -> Edges:
-        """Bisect the segments, weigh the edges that cross them, and record the paths to these edges.
+        """Locate edges on the segments by bisection, compute their weights, and record the paths to the edges.
 
         ``weight`` is the weight of each lane in the mean over all segments; lanes of weight zero return no edge.
         """

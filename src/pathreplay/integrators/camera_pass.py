@@ -85,7 +85,9 @@ class Pass:
     spp: int = 0
     share: float = 1.0  # weight in the mean over the parts of a split pass: see `parts`
     uses_sobol: bool = False
-    flow: FilmFlow | None = None  # motion of film positions; derivatives of rays then contain only the remaining motion
+    # If set, film positions s move with the velocity v of the flow. The derivative of a camera ray c(s, π) with respect
+    # to the parameters π is then ∂c/∂π + ∂c/∂s v, in place of ∂c/∂π: see `camera_flow`.
+    flow: FilmFlow | None = None
 
     @staticmethod
     def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, uses_sobol: bool = False) -> Pass:

@@ -264,9 +264,10 @@ class PathReplayIntegrator(PathIntegrator):
         return result.image, state.after(result)
 
     def begin(self, scene: mi.Scene) -> PassState:
-        """Create the state of a pass, with the control variate of media.
+        """Create the state of a pass. In scenes with media, the state contains the learned control variate.
 
-        A user's recording by `dr.freeze` cannot learn, and gets no control variate.
+        While `dr.freeze` records a function of the user, the state contains no control variate, because the recorded
+        passes cannot update it.
         """
         state = PathIntegrator.begin(self, scene)
         if not state.is_complete or not facts_of(scene).has_media:

@@ -15,7 +15,7 @@ LARGEST = 2**31 - 1
 
 
 def choice(props: mi.Properties, plugin: str, name: str, default: T, choices: tuple[T, ...]) -> T:
-    """Read a property that must be one of ``choices``. Raises PathreplayError otherwise."""
+    """Read a property. Raises PathreplayError if its value is not one of ``choices``."""
     value = props.get(name, default)
     # Compare types as well, since 1 == True.
     if not any(type(value) is type(allowed) and value == allowed for allowed in choices):
@@ -47,7 +47,7 @@ def whole_number(
 
 
 def deviation(props: mi.Properties, plugin: str, name: str, default: float) -> float:
-    """Read a finite standard deviation of at least 0. Raises PathreplayError otherwise."""
+    """Read a standard deviation. Raises PathreplayError if the value is not a finite number of at least 0."""
     value = props.get(name, default)
     if type(value) not in (int, float) or not 0 <= value < float("inf"):
         raise PathreplayError(f"{plugin}: {name} = {shown(value)}: use a finite standard deviation >= 0 (0 = off)")
@@ -55,7 +55,7 @@ def deviation(props: mi.Properties, plugin: str, name: str, default: float) -> f
 
 
 def flag(props: mi.Properties, plugin: str, name: str, default: bool) -> bool:
-    """Read a boolean. Raises PathreplayError otherwise."""
+    """Read a boolean property. Raises PathreplayError if the value is not a boolean."""
     value = props.get(name, default)
     if type(value) is not bool:
         raise PathreplayError(f"{plugin}: {name} = {shown(value)}: use true or false")

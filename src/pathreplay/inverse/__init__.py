@@ -1,1 +1,1 @@
-"""Inverse rendering: parameters, views, losses, objective, optimisers and the loop; the library below jobs."""
+"""Inverse rendering: parameters, views, losses, objective, optimisers and the loop. Used by `jobs` and `library`."""

@@ -6,7 +6,7 @@ unpolarised Fresnel reflectance, and η_ti = 1/η (from outside) or η (from ins
     reflection      wo = (-wi_x, -wi_y, wi_z)                            f = F · specular_reflectance
     transmission    wo = (-η_ti wi_x, -η_ti wi_y, -sign(wi_z) cos θ_t)   f = (1 - F) · specular_transmittance · s
 
-where s = η_ti² in radiance mode and 1 in importance mode. Flags and values are the same as in Mitsuba's plugin. The
+where s = η_ti² in radiance mode and 1 in importance mode. BSDF flags, wo and f are the same as in Mitsuba's plugin. The
 probability of reflection is F, as in Mitsuba, with one exception. For rays from the denser side, below the critical
 angle, transmission is sampled with a probability of at least 1/4. Near the critical angle dF is unbounded, and samples
 with the small probability 1 - F would contribute nearly all of the derivative.
@@ -14,9 +14,10 @@ with the small probability 1 - F would contribute nearly all of the derivative.
 The direction wo and the weight are differentiated with respect to `eta` and si.wi. The weight is also differentiated
 with respect to the tints `specular_reflectance` and `specular_transmittance`. The probability of choosing a lobe and
 the onset of total internal reflection are *not* differentiated (F is continuous at the onset). bs.pdf is detached, and
-the weight is f / detach(pdf). The value of the weight is therefore the tint (times s for transmission), while its
-derivative contains the Fresnel term. If an edge of the scene is seen through a lobe, the motion of the edge is a
-boundary term, which belongs to the integrator.
+the weight is f / detach(pdf). If both lobes are enabled, the value of the weight is the tint (times s for
+transmission), while its derivative contains the Fresnel term. Where the minimum of 1/4 applies, because F exceeds 3/4,
+the value has an additional factor: F / (3/4) for reflection and (1 - F) / (1/4) for transmission. If an edge of the
+scene is seen through a lobe, the motion of the edge is a boundary term, which belongs to the integrator.
 """
 
 from __future__ import annotations

@@ -25,7 +25,10 @@ _COLOURS = ("SRGBReflectanceSpectrum", "D65Spectrum")
 
 
 def coefficient_channels(params: mi.SceneParameters, key: str) -> int:
-    """Return the number of channels if a parameter stores coefficients: 3, or 4 with a factor. Otherwise return 0."""
+    """Return the number of channels of a parameter that stores the coefficients c_0, c_1, c_2; 0 for other parameters.
+
+    The number is 3, or 4 for environment maps and grid volumes, whose fourth channel is a factor of the spectrum.
+    """
     if not mi.is_spectral:
         return 0
     owner, name = params.properties[key][2], key.rsplit(".", 1)[-1]

@@ -94,7 +94,11 @@ def held_direction(
 
 
 def _share(h0: mi.Float, y: SurfacePoint, towards: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Vector3f]:
-    """Compute the blend factor φ, and the vector ``slope`` with ∇φ·V_H = slope·d_H'. Detached."""
+    """Compute the blend factor φ, and a vector ``slope`` with ∇φ·V_H = slope·d_H'. Both results are detached.
+
+    V_H is the velocity field of directions that follow the hit point y. d_H' is the derivative of the direction from x
+    to y with respect to the parameters. ``towards`` is y - x.
+    """
     r = dr.norm(towards)
     n = dr.normalize(y.A)
     turned = dr.dot(n, towards) > 0

@@ -117,7 +117,10 @@ class SurfaceFlow:
         return dr.gather(mi.Bool, self.flows, _node(_cell_at(position)[0], 0, 0))
 
     def leaves_rest_at(self, position: mi.Point2f) -> mi.Bool:
-        """Return `moves_at`: the camera ray through a film position moves if the position moves."""
+        """Return whether the camera ray through a film position may move: see `FilmFlow`.
+
+        The camera is static, so its rays move only with their film positions. The result therefore equals `moves_at`.
+        """
         return self.moves_at(position)
 
     def carry_tangents(self) -> None:
@@ -161,6 +164,6 @@ def _cell_of(node: mi.UInt32) -> mi.Point2i:
 
 
 def _node(cell: mi.Point2i, x: int, y: int) -> mi.UInt32:
-    """Return the node x columns and y rows after the first node of a cell, clamped to the grid."""
+    """Return the row-major index of the node x columns and y rows after a cell's first node, clamped to the grid."""
     at = dr.clip(cell + mi.Point2i(x + MARGIN, y + MARGIN), 0, NODES - 1)
     return mi.UInt32(at.x + at.y * NODES)

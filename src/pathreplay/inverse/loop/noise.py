@@ -43,9 +43,9 @@ def ratios(history: Sequence[Entry]) -> dict[str, float]:
 def next_spp(auto: AdaptiveSpp, history: Sequence[Entry]) -> int:
     """Return the samples per pixel of the next iteration, which depend on the history alone.
 
-    The number changes only after multiples of `WINDOW` iterations with equal samples. It is doubled if the ratio of any
-    variable is below the target. It is halved if all ratios are above twice the target, because halving the samples at
-    most halves the ratios.
+    The number of samples can change whenever it has been constant for a multiple of `WINDOW` iterations. It is doubled
+    if the signal-to-noise ratio of at least one variable is below the target. It is halved if the ratios of all
+    variables are above twice the target, because halving the samples at most halves the ratios.
     """
     if not history:
         return auto.min
