@@ -81,10 +81,8 @@ class Lane:
 
     def close(self) -> None:
         """End the server."""
-        assert self._server.stdin is not None
-        self._server.stdin.close()
-        self._server.kill()
-        self._server.wait()
+        with self._server:  # closes its pipes
+            self._server.kill()
 
 
 def make_assets(scratch: Path) -> Path:
