@@ -1,0 +1,185 @@
+"""Loops that solve a problem: the one that Mitsuba's tutorials show, and that of pathreplay. An iteration uses one view.
+
+Both minimise the mean squared difference by Adam, with the same rates (fractions of a parameter's range), samples and
+bounds. The plain loop takes the views in turn, as the tutorials do; pathreplay has `view_batch_size = 1`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import pathreplay
+
+from .problem import Task, Values, sensor_index, to_array
+from .problems import PROBLEMS, Kind
+
+SEEDS = 2**16
+"""Seeds of the iterations of a run."""
+
+
+class Loop(Protocol):
+    """A loop at some iteration."""
+
+    def step(self) -> None:
+        """Take one iteration, which may still be computed when this returns."""
+
+    def values(self) -> Values:
+        """Wait for the iterations, and return the values."""
+
+    def reset(self) -> None:
+        """Return to the initial values; compiled kernels are kept."""
+
+
+class Plain:
+    """`mi.render`, a loss, `dr.backward`, Adam and clipping."""
+
+    def __init__(self, task: Task, rate: float, spp: int, seed: int, integrator: str, **adam: Any) -> None:
+        self.task, self.rate, self.spp, self.seed, self.adam = task, rate, spp, seed, adam
+        self.integrator = mi.load_dict({"type": integrator, **task.problem.limits})
+        self.views = [sensor_index(task.scene, name) for name in task.problem.train]
+        self.targets = [mi.TensorXf(target) for target in task.targets]
+        self.params = mi.traverse(task.scene)
+        self.reset()
+
+    def reset(self) -> None:
+        """See `Loop`."""
+        unknowns = self.task.problem.unknowns
+        smooth = any(unknown.large_steps for unknown in unknowns.values())
+        self.optimizer = mi.ad.Adam(lr=self.rate, uniform=smooth, **self.adam)
+        self.steps: dict[str, mi.ad.LargeSteps] = {}
+        for name, unknown in unknowns.items():
+            start = self.task.initial(name)
+            value = mi.TensorXf(start) if unknown.shape else type(self.task.stored[name])(start)
+            if unknown.large_steps:
+                faces = self.params[name.replace("vertex_positions", "faces")]
+                self.steps[name] = mi.ad.LargeSteps(value, faces, unknown.large_steps)
+                value = self.steps[name].to_differential(value)
+            self.optimizer[name] = value
+            self.optimizer.set_learning_rate({name: self.rate * unknown.unit})
+        self.count = 0
+
+    def step(self) -> None:
+        """See `Loop`."""
+        self._apply()
+        turn = self.count % len(self.views)
+        seed = self.seed * SEEDS + self.count
+        image = mi.render(
+            self.task.scene, self.params, sensor=self.views[turn], integrator=self.integrator, spp=self.spp, seed=seed
+        )
+        dr.backward(dr.mean(dr.square(image - self.targets[turn]), axis=None))
+        self.optimizer.step()
+        for name, unknown in self.task.problem.unknowns.items():
+            if not unknown.large_steps:
+                self.optimizer[name] = dr.clip(self.optimizer[name], unknown.lower, unknown.upper)
+        self.count += 1
+
+    def values(self) -> Values:
+        """See `Loop`."""
+        dr.sync_thread()
+        return {name: to_array(self._decoded(name)) for name in self.task.problem.unknowns}
+
+    def _decoded(self, name: str) -> Any:
+        value = self.optimizer[name]
+        return self.steps[name].from_differential(value) if name in self.steps else value
+
+    def _apply(self) -> None:
+        problem = self.task.problem
+        for name, unknown in problem.unknowns.items():
+            if not unknown.shape:
+                self.params[name] = self._decoded(name)
+        for key, made in problem.derived.items():
+            first = self.task.first[key]
+            self.params[key] = made.function(type(first)(first), *(self.optimizer[name] for name in made.of))
+        self.params.update()
+
+
+class Own:
+    """`pathreplay.init` and `pathreplay.step`."""
+
+    def __init__(
+        self, task: Task, rate: float, spp: int, seed: int, optimizer: str = "adam",
+        of_grids: Mapping[str, Any] | None = None, **settings: Any,
+    ) -> None:  # fmt: skip
+        self.problem = _problem(task, rate, spp, seed, of_grids or {})
+        self.first = self.state = pathreplay.init(self.problem, optimizer, **{"view_batch_size": 1, **settings})
+
+    def reset(self) -> None:
+        """See `Loop`."""
+        self.state = self.first
+
+    def step(self) -> None:
+        """See `Loop`."""
+        self.state = pathreplay.step(self.problem, self.state)
+
+    def values(self) -> Values:
+        """See `Loop`."""
+        return {name: np.array(value) for name, value in self.state.values.items()}
+
+
+def _problem(task: Task, rate: float, spp: int, seed: int, of_grids: Mapping[str, Any]) -> pathreplay.Problem:
+    problem = task.problem
+    parameters = {
+        name: pathreplay.Parameter(
+            initial=task.initial(name) if unknown.shape or isinstance(unknown.initial, np.ndarray) else unknown.initial,
+            bounds=(None, None) if unknown.large_steps else (unknown.lower, unknown.upper),
+            learning_rate=rate * unknown.unit,
+            shape=unknown.shape or None,
+            large_steps_lambda=unknown.large_steps or None,
+            **(of_grids if name in task.stored and len(dr.shape(task.stored[name])) > 2 else {}),
+        )
+        for name, unknown in problem.unknowns.items()
+    }
+    return pathreplay.Problem(
+        task.scene,
+        parameters,
+        [pathreplay.View(name, target) for name, target in zip(problem.train, task.targets, strict=True)],
+        derived={key: pathreplay.Derived(made.function, made.of) for key, made in problem.derived.items()},
+        integrator={"type": "pathreplay", **problem.limits},
+        spp=spp,
+        seed=seed,
+    )
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A named way to solve a problem."""
+
+    begin: Callable[[Task, float, int, int], Loop]
+    """Task, learning rate, samples per pixel and seed -> a loop at its initial values."""
+    applies: Callable[[Kind], bool] = lambda kind: True
+    rated: bool = True
+    """Whether it has a learning rate; otherwise only samples are searched."""
+
+
+def plain(integrator: str, **adam: Any) -> Entry:
+    """The plain loop with one of Mitsuba's integrators."""
+    return Entry(
+        lambda task, rate, spp, seed: Plain(task, rate, spp, seed, integrator, **adam),
+        lambda kind: integrator in kind.integrators,
+    )
+
+
+def own(**options: Any) -> Entry:
+    """This project, with options of `Own`."""
+    return Entry(lambda task, rate, spp, seed: Own(task, rate, spp, seed, **options))
+
+
+STOCK = ("prb", "prbvolpath", "prb_projective")
+
+#: All ways, by the name that tables give them: an integrator, and what is done with it.
+ENTRIES: dict[str, Entry] = {
+    **{f"{name}, plain loop": plain(name) for name in STOCK},
+    **{f"{name}, beta_2 = 0.99": plain(name, beta_2=0.99) for name in STOCK},
+    "pathreplay": own(),
+}
+
+
+def entries_of(problem: str) -> tuple[str, ...]:
+    """Names of the entries that solve this problem, Mitsuba's first."""
+    return tuple(name for name, entry in ENTRIES.items() if entry.applies(PROBLEMS[problem]))

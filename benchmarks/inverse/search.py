@@ -1,0 +1,83 @@
+"""The search for a learning rate and a number of samples, the same for every loop: the error is followed in time."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+
+from ..measures.job import Curve
+from .loops import Loop
+from .problem import Values
+
+MARKS = (1 / 3, 1 / 10, 1 / 30)
+"""Fractions of the initial held-out error."""
+MIDDLE = MARKS[1]
+GROWTH = 2**0.5
+"""Ratio of the iterations after which the error is measured."""
+WARM_UP = 3
+"""Iterations per training view before the clock starts: kernels are traced, recorded and compiled in them."""
+
+
+def followed(
+    loop: Loop, error: Callable[[Values], float], goal: float, budget: float, clock: Callable[[], float] = time.perf_counter
+) -> Curve:
+    """Run a loop until its error is ``goal`` times the initial one or its iterations have taken ``budget`` seconds.
+
+    The error is measured while the clock stands. A value that is not finite ends the run.
+    """
+    errors, steps, seconds = [error(loop.values())], [0], [0.0]
+    while seconds[-1] < budget and errors[-1] > goal * errors[0]:
+        target = max(steps[-1] + 1, round(steps[-1] * GROWTH))
+        done, start = steps[-1], clock()
+        while done < target and seconds[-1] + clock() - start < budget:
+            loop.step()
+            done += 1
+        values = loop.values()
+        seconds.append(seconds[-1] + clock() - start)
+        steps.append(done)
+        errors.append(error(values))
+        if not errors[-1] < float("inf"):
+            errors[-1] = float("inf")
+            break
+    return Curve(0.0, 0, 0, tuple(steps), tuple(seconds), tuple(errors))
+
+
+def warmed(loop: Loop, iterations: int, clock: Callable[[], float] = time.perf_counter) -> float:
+    """Take the first iterations twice, and return to the initial values; returns the seconds that they took."""
+    start = clock()
+    for _ in range(iterations):
+        loop.step()
+    loop.values()
+    loop.reset()
+    return clock() - start
+
+
+Try = Callable[[float, int], Curve]
+
+
+def searched(rates: Sequence[float], samples: Sequence[int], run: Try) -> Iterator[Curve]:
+    """Run every point of the grid."""
+    for spp, rate in product(samples, rates):
+        yield replace(run(rate, spp), rate=rate, spp=spp)
+
+
+def best(curves: Sequence[Curve]) -> Curve:
+    """The curve that reaches the middle mark first; if none does, the one with the smallest final error."""
+    return min(curves, key=lambda curve: (reached(curve, MIDDLE)[0], curve.errors[-1] / curve.errors[0]))
+
+
+def reached(curve: Curve, mark: float) -> tuple[float, float]:
+    """Seconds and iterations until the error is ``mark`` times the initial one; infinite if it never is.
+
+    Between two measurements the logarithm of the error is interpolated linearly.
+    """
+    goal = mark * curve.errors[0]
+    for k in range(1, len(curve.errors)):
+        if curve.errors[k] <= goal:
+            before, after = (math.log(max(error, 1e-30)) for error in curve.errors[k - 1 : k + 1])
+            t = (before - math.log(goal)) / (before - after)
+            return tuple(a[k - 1] + t * (a[k] - a[k - 1]) for a in (curve.seconds, curve.steps))
+    return math.inf, math.inf

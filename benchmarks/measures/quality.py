@@ -1,0 +1,63 @@
+"""Optimisations of an inverse problem, by the best point of the same grid for each loop: what task `quality` measures."""
+
+from __future__ import annotations
+
+import gc
+import time
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from ..inverse.loops import ENTRIES
+from ..inverse.problem import Task
+from ..inverse.problems import PROBLEMS
+from ..inverse.search import MARKS, MIDDLE, WARM_UP, best, followed, reached, searched, warmed
+from .job import Curve, Job, Measure
+
+
+class Quality(Measure):
+    """The first call of a method searches the grid; later calls run its best point with their seeds."""
+
+    SEARCH_SEED = 1000
+    """Seed of the search: no round has it, so that luck in the search does not repeat itself."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.task = Task(PROBLEMS[job.scene].build(job.resolution))
+        self.curves: dict[str, list[Curve]] = {}
+
+    def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
+        """Seconds until the middle mark (all seconds of the optimisation, if it is not reached), and the last error."""
+        if method in self.curves:
+            choice = best(self.curves[method][: self._points(method)])
+            curve = self._run(method, choice.rate, choice.spp, seed, min(MARKS))
+            self.curves[method].append(curve)
+            seconds = min(reached(curve, MIDDLE)[0], curve.seconds[-1])
+            return seconds, np.array([curve.errors[-1]])
+        start, rates = time.perf_counter(), self._rates(method)
+        found = searched(
+            rates, self.job.samples, lambda rate, spp: self._run(method, rate, spp, self.SEARCH_SEED, MIDDLE)
+        )
+        self.curves[method] = [replace(curve, searched=True) for curve in found]
+        return time.perf_counter() - start, np.array([best(self.curves[method]).errors[-1]])
+
+    def forget(self) -> None:
+        """Nothing: what the search has found is kept."""
+
+    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
+        """All curves, those of the search first."""
+        return {name: {"curves": [asdict(curve) for curve in self.curves[name]]} for name in kept}
+
+    def _points(self, method: str) -> int:
+        return len(self._rates(method)) * len(self.job.samples)
+
+    def _rates(self, method: str) -> tuple[float, ...]:
+        return self.job.rates if ENTRIES[method].rated else self.job.rates[:1]
+
+    def _run(self, method: str, rate: float, spp: int, seed: int, goal: float) -> Curve:
+        gc.collect()  # scenes and recordings of earlier runs slow down tracing
+        loop = ENTRIES[method].begin(self.task, rate, spp, seed)
+        untimed = warmed(loop, WARM_UP * len(self.task.problem.train))
+        curve = followed(loop, self.task.error, goal, self.job.budget)
+        return replace(curve, rate=rate, spp=spp, seed=seed, warm_up=untimed)
