@@ -1,4 +1,4 @@
-"""Loops that solve a problem: the one that Mitsuba's tutorials show, and that of pathreplay. An iteration uses one view.
+"""Loops that solve a problem: the one of Mitsuba's tutorials, and that of pathreplay. An iteration uses one view.
 
 Both minimise the mean squared difference by Adam, with the same rates (fractions of a parameter's range), samples and
 bounds. The plain loop takes the views in turn, as the tutorials do; pathreplay has `view_batch_size = 1`.
@@ -7,7 +7,7 @@ bounds. The plain loop takes the views in turn, as the tutorials do; pathreplay 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import drjit as dr
@@ -66,18 +66,22 @@ class Plain:
 
     def step(self) -> None:
         """See `Loop`."""
-        self._apply()
-        turn = self.count % len(self.views)
-        seed = self.seed * SEEDS + self.count
-        image = mi.render(
-            self.task.scene, self.params, sensor=self.views[turn], integrator=self.integrator, spp=self.spp, seed=seed
-        )
-        dr.backward(dr.mean(dr.square(image - self.targets[turn]), axis=None))
+        self._differentiate(self.count % len(self.views), self.seed * SEEDS + self.count)
         self.optimizer.step()
         for name, unknown in self.task.problem.unknowns.items():
             if not unknown.large_steps:
                 self.optimizer[name] = dr.clip(self.optimizer[name], unknown.lower, unknown.upper)
         self.count += 1
+
+    def _differentiate(self, turn: int, seed: int) -> None:
+        """Add the gradient of a view to the optimizer's values."""
+        self._apply()
+        dr.backward(self._loss(turn, seed, self.params))
+
+    def _loss(self, turn: int, seed: int, params: mi.SceneParameters | None) -> mi.Float:
+        view = self.views[turn]
+        image = mi.render(self.task.scene, params, sensor=view, integrator=self.integrator, spp=self.spp, seed=seed)
+        return dr.mean(dr.square(image - self.targets[turn]), axis=None)
 
     def values(self) -> Values:
         """See `Loop`."""
@@ -88,15 +92,40 @@ class Plain:
         value = self.optimizer[name]
         return self.steps[name].from_differential(value) if name in self.steps else value
 
-    def _apply(self) -> None:
-        problem = self.task.problem
+    def _apply(self, instead: Mapping[str, Any] | None = None) -> None:
+        """Set the scene's parameters, some of them to other values than the optimizer's."""
+        problem, values = (
+            self.task.problem,
+            {**{name: self.optimizer[name] for name in self.optimizer.keys()}, **(instead or {})},
+        )
         for name, unknown in problem.unknowns.items():
             if not unknown.shape:
-                self.params[name] = self._decoded(name)
+                self.params[name] = self._decoded(name) if name in self.steps else values[name]
         for key, made in problem.derived.items():
             first = self.task.first[key]
-            self.params[key] = made.function(type(first)(first), *(self.optimizer[name] for name in made.of))
+            self.params[key] = made.function(type(first)(first), *(values[name] for name in made.of))
         self.params.update()
+
+
+class Differences(Plain):
+    """The plain loop with central differences, two images with the same random numbers for each number."""
+
+    STEP = 0.002
+    """Half the distance of the two images, as a fraction of the parameter's range."""
+
+    def _differentiate(self, turn: int, seed: int) -> None:
+        for name, unknown in self.task.problem.unknowns.items():
+            value, gradient = np.array(dr.detach(self.optimizer[name])), []
+            kind = type(self.optimizer[name])
+            for k in range(value.size):
+                losses = []
+                for sign in (1, -1):
+                    moved = value.copy()
+                    moved.flat[k] += sign * self.STEP * unknown.unit
+                    self._apply({name: kind(moved)})
+                    losses.append(self._loss(turn, seed, None))
+                gradient.append((losses[0] - losses[1]).array[0] / (2 * self.STEP * unknown.unit))
+            dr.set_grad(self.optimizer[name], kind(np.reshape(gradient, value.shape).astype(np.float32)))
 
 
 class Own:
@@ -165,6 +194,14 @@ def plain(integrator: str, **adam: Any) -> Entry:
     )
 
 
+def differences(integrator: str) -> Entry:
+    """The plain loop without an adjoint."""
+    return Entry(
+        lambda task, rate, spp, seed: Differences(task, rate, spp, seed, integrator),
+        lambda kind: integrator in kind.integrators,
+    )
+
+
 def own(**options: Any) -> Entry:
     """This project, with options of `Own`."""
     return Entry(lambda task, rate, spp, seed: Own(task, rate, spp, seed, **options))
@@ -175,7 +212,8 @@ STOCK = ("prb", "prbvolpath", "prb_projective")
 #: All ways, by the name that tables give them: an integrator, and what is done with it.
 ENTRIES: dict[str, Entry] = {
     **{f"{name}, plain loop": plain(name) for name in STOCK},
-    **{f"{name}, beta_2 = 0.99": plain(name, beta_2=0.99) for name in STOCK},
+    "prb, beta_2 = 0.99": plain("prb", beta_2=0.99),
+    "path, central difference": differences("path"),
     "pathreplay": own(),
 }
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -13,9 +12,9 @@ from ..scenes.surfaces import sky
 from .problem import Made, Problem, Unknown
 
 _LIMITS = {"max_depth": 4, "rr_depth": 16}
-_AROUND = {"west": (-1.0, -4.2, 2.2), "east": (3.6, -2.2, 2.0), "north": (0.6, 4.0, 2.6), "top": (-2.4, 1.6, 3.6),
-           "near": (1.6, -2.8, 2.8)}  # fmt: skip
-_TRAIN, _HELD_OUT = ("west", "east", "north"), ("top", "near")
+_AROUND = {"west": (-1.0, -4.2, 2.2), "east": (3.6, -2.2, 2.0), "north": (0.6, 4.0, 2.6), "top": (0.0, -1.0, 4.6),
+           "far": (-3.4, 1.2, 2.6), "near": (2.0, -3.2, 2.8), "high": (-1.6, 1.6, 3.8)}  # fmt: skip
+_TRAIN, _HELD_OUT = ("west", "east", "north", "top", "far"), ("near", "high")
 
 
 def _views(pixels: int, target: list[float], fov: float) -> dict[str, SceneDict]:
@@ -32,7 +31,9 @@ def _pattern(rows: int, columns: int, channels: int, low: float, high: float, se
     total = np.zeros((rows, columns, channels))
     for wave in (0.5, 1, 2, 4, 8):
         angle, phase = random.uniform(0, 2 * np.pi, (2, channels))
-        total += np.cos(2 * np.pi * wave * (u[..., None] * np.cos(angle) + v[..., None] * np.sin(angle)) + phase) / wave**0.5
+        total += (
+            np.cos(2 * np.pi * wave * (u[..., None] * np.cos(angle) + v[..., None] * np.sin(angle)) + phase) / wave**0.5
+        )
     total = (total - total.min()) / (total.max() - total.min())
     return (low + (high - low) * total).astype(np.float32)
 
@@ -55,9 +56,9 @@ def _balls() -> dict[str, SceneDict]:
     }
 
 
-def texture(pixels: int) -> Problem:
+def texture(pixels: int, cells: int) -> Problem:
     """The texture of a floor with two balls on it."""
-    floor = {"type": "diffuse", "reflectance": _map(_pattern(pixels, pixels, 3, 0.1, 0.9, seed=1))}
+    floor = {"type": "diffuse", "reflectance": _map(_pattern(cells, cells, 3, 0.1, 0.9, seed=1))}
     ground = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(1.6), "bsdf": floor}
     scene = {"type": "scene", "sky": _sky(), "floor": ground, **_balls(), **_views(pixels, [0, 0, 0], 42)}
     unknowns = {"floor.bsdf.reflectance.data": Unknown(0.5, 0.0, 1.0)}
@@ -83,7 +84,7 @@ def _widened(first: Any, fov: Any) -> Any:
     return type(first)(first + fov[0].array)
 
 
-def camera(pixels: int) -> Problem:
+def camera(pixels: int, cells: int) -> Problem:
     """Three shifts, three angles and the field of view of a camera; the second camera of a rig is held out.
 
     The true shifts and angles are zero, and the true field of view is that in the scene.
@@ -106,13 +107,13 @@ def camera(pixels: int) -> Problem:
     )  # fmt: skip
 
 
-def object_under_sky(pixels: int) -> Problem:
-    """Albedo and roughness maps of a ball on a grey floor, and an environment map of 8 x 16 pixels that no view shows."""
-    half = pixels // 2
+def object_under_sky(pixels: int, cells: int) -> Problem:
+    """Albedo and roughness maps of a ball on a grey floor, and an environment map of 8 x 16 pixels."""
+    half = cells // 2
     bsdf = {
         "type": "principled",
-        "base_color": _map(_pattern(half, pixels, 3, 0.1, 0.9, seed=2)),
-        "roughness": _map(_pattern(half, pixels, 1, 0.15, 0.7, seed=3)),
+        "base_color": _map(_pattern(half, cells, 3, 0.1, 0.9, seed=2)),
+        "roughness": _map(_pattern(half, cells, 1, 0.15, 0.7, seed=3)),
         "specular": 0.6,
     }
     sphere = {"type": "sphere", "center": [0, 0, 1], "bsdf": bsdf}
@@ -129,15 +130,18 @@ def object_under_sky(pixels: int) -> Problem:
     return Problem(scene, unknowns, _TRAIN, _HELD_OUT, _LIMITS)
 
 
-def metal(pixels: int) -> Problem:
+def metal(pixels: int, cells: int) -> Problem:
     """`principled` fitted to copper (Mitsuba's measured indices, microfacets of roughness 0.3): it is another model.
 
-    So the error has a floor above zero. Five numbers: base colour, roughness, specular.
+    So the error has a floor above zero. The unknowns are the base colour and the roughness.
     """
     around = {"sky": _sky(), **_views(pixels, [0, 0, 0], 30)}
     fit = {
-        "type": "principled", "base_color": {"type": "rgb", "value": 0.5}, "metallic": 1.0, "roughness": 0.6, "spec_tint": 0.0,
-    }  # fmt: skip
+        "type": "principled",
+        "base_color": {"type": "rgb", "value": 0.5},
+        "metallic": 1.0,
+        "roughness": 0.7,
+    }
     copper = {"type": "roughconductor", "material": "Cu", "distribution": "ggx", "alpha": 0.3}
     scene = {"type": "scene", "ball": {"type": "sphere", "bsdf": fit}, **around}
     truth = {"type": "scene", "ball": {"type": "sphere", "bsdf": copper}, **around}

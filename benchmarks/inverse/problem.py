@@ -1,4 +1,4 @@
-"""What an inverse problem consists of, and its loaded form: targets, initial values, and the error in held-out views."""
+"""What an inverse problem consists of, and its loaded form: targets, initial values, error in held-out views."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class Problem:
     derived: Mapping[str, Made] = field(default_factory=dict)
     derived_held_out: Mapping[str, Made] = field(default_factory=dict)  # parameters of held-out sensors
     judge: str = "path"  # Mitsuba's integrator that renders targets and held-out images
-    target_spp: int = 1024
-    judge_spp: int = 256
+    target_paths: int = 2**21  # of each target
+    judge_paths: int = 2**18  # of each held-out image
     seen: SceneDict | None = None  # the scene that the targets show, if no values of ``scene`` give it
 
 
@@ -111,20 +111,20 @@ class Task:
         Images and targets have the same random numbers, so that their noise cancels as the values approach the truth.
         """
         self.put(values)
-        images = [self._image(self.scene, name) for name in self.problem.held_out]
+        images = [self._image(self.scene, name, self.problem.judge_paths) for name in self.problem.held_out]
         pairs = zip(images, self.wanted, strict=True)
         return float(np.mean([np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)) for a, b in pairs]))
 
     def _images(self, scene: mi.Scene) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Targets of the training views, and of the held-out views."""
-        spp = self.problem.target_spp
-        targets = [self._image(scene, name, spp, SEED + 1) for name in self.problem.train]
-        return targets, [self._image(scene, name) for name in self.problem.held_out]
+        targets = [self._image(scene, name, self.problem.target_paths, SEED + 1) for name in self.problem.train]
+        return targets, [self._image(scene, name, self.problem.judge_paths) for name in self.problem.held_out]
 
-    def _image(self, scene: mi.Scene, name: str, spp: int = 0, seed: int = SEED) -> np.ndarray:
-        samples = spp or self.problem.judge_spp
+    def _image(self, scene: mi.Scene, name: str, paths: int, seed: int = SEED) -> np.ndarray:
+        index = sensor_index(scene, name)
+        spp = max(1, paths // int(np.prod(scene.sensors()[index].film().crop_size())))
         with dr.suspend_grad():
-            image = mi.render(scene, sensor=sensor_index(scene, name), integrator=self.integrator, spp=samples, seed=seed)
+            image = mi.render(scene, sensor=index, integrator=self.integrator, spp=spp, seed=seed)
         return np.array(image, np.float64)
 
 

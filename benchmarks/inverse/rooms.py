@@ -1,4 +1,4 @@
-"""Problems indoors: lamps and materials of a Cornell box, a pane of glass, and a mesh seen by its outline and shadow."""
+"""Problems indoors: lamps and materials of a Cornell box, a pane of glass, a mesh seen by its outline and shadow."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _view(pixels: int, origin: list[float], target: list[float], fov: float) -> 
     return view
 
 
-def room(pixels: int) -> Problem:
+def room(pixels: int, cells: int) -> Problem:
     """The Cornell box with two lamps of different colours and four materials: eighteen numbers."""
     scene: SceneDict = mi.cornell_box()
     del scene["sensor"]
@@ -31,8 +31,12 @@ def room(pixels: int) -> Problem:
     for name, colour in colours.items():
         scene[name] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}}
     scene["large-box"]["bsdf"] = {"type": "ref", "id": "blue"}
-    # References are resolved in order: materials first, and lamps whose material is one of them last.
-    scene = {"type": "scene", **{name: scene.pop(name) for name in colours}, **{k: v for k, v in scene.items() if k != "type"}}
+    # References are resolved in order, so materials come first.
+    scene = {
+        "type": "scene",
+        **{name: scene.pop(name) for name in colours},
+        **{k: v for k, v in scene.items() if k != "type"},
+    }
     for name, origin, target, fov in (
         ("front", [0.0, 0.0, 3.9], [0.0, 0.0, 0.0], 39.0),
         ("left-side", [-0.7, 0.3, 1.6], [0.3, -0.3, -0.3], 70.0),
@@ -50,7 +54,7 @@ def room(pixels: int) -> Problem:
     )
 
 
-def glass(pixels: int) -> Problem:
+def glass(pixels: int, cells: int) -> Problem:
     """The built-in `glass-pane`: index and normal map of an uneven pane. Its `dielectric_ad` serves all loops."""
     scene = builtin.glass_pane(pixels, texture=12)
     scene["low"] = _view(pixels, [0.6, -1.3, 2.5], [0, 0, 0], 44)
@@ -61,12 +65,11 @@ def glass(pixels: int) -> Problem:
         ("front", "left", "right"),
         ("low", "high"),
         {"max_depth": 5, "rr_depth": 16},
-        judge_spp=512,
-        target_spp=4096,
+        target_paths=2**22,
     )
 
 
-def mesh(pixels: int) -> Problem:
+def mesh(pixels: int, cells: int) -> Problem:
     """The built-in `shadows`: a black body, from a sphere with as many vertices."""
     names = [f"view{n + 1}" for n in range(6)]
     return Problem(

@@ -22,7 +22,11 @@ WARM_UP = 3
 
 
 def followed(
-    loop: Loop, error: Callable[[Values], float], goal: float, budget: float, clock: Callable[[], float] = time.perf_counter
+    loop: Loop,
+    error: Callable[[Values], float],
+    goal: float,
+    budget: float,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Curve:
     """Run a loop until its error is ``goal`` times the initial one or its iterations have taken ``budget`` seconds.
 
@@ -46,7 +50,7 @@ def followed(
 
 
 def warmed(loop: Loop, iterations: int, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Take the first iterations twice, and return to the initial values; returns the seconds that they took."""
+    """Take iterations and return to the initial values; returns the seconds that this took."""
     start = clock()
     for _ in range(iterations):
         loop.step()

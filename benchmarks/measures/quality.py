@@ -1,4 +1,4 @@
-"""Optimisations of an inverse problem, by the best point of the same grid for each loop: what task `quality` measures."""
+"""Optimisations of an inverse problem, with the best point of one grid for each loop: see task `quality`."""
 
 from __future__ import annotations
 
@@ -56,6 +56,14 @@ class Quality(Measure):
         return self.job.rates if ENTRIES[method].rated else self.job.rates[:1]
 
     def _run(self, method: str, rate: float, spp: int, seed: int, goal: float) -> Curve:
+        try:
+            return self._followed(method, rate, spp, seed, goal)
+        except Exception as error:
+            while error.__cause__ is not None:  # Dr.Jit hides what was wrong in a loop
+                error = error.__cause__
+            raise RuntimeError(str(error)) from None
+
+    def _followed(self, method: str, rate: float, spp: int, seed: int, goal: float) -> Curve:
         gc.collect()  # scenes and recordings of earlier runs slow down tracing
         loop = ENTRIES[method].begin(self.task, rate, spp, seed)
         untimed = warmed(loop, WARM_UP * len(self.task.problem.train))
