@@ -41,7 +41,8 @@ class Plain:
 
     def __init__(self, task: Task, rate: float, spp: int, seed: int, integrator: str, **adam: Any) -> None:
         self.task, self.rate, self.spp, self.seed, self.adam = task, rate, spp, seed, adam
-        self.integrator = mi.load_dict({"type": integrator, **task.problem.limits})
+        limits = {} if integrator == "direct_projective" else task.problem.limits  # it has no depth
+        self.integrator = mi.load_dict({"type": integrator, **limits})
         self.views = [sensor_index(task.scene, name) for name in task.problem.train]
         self.targets = [mi.TensorXf(target) for target in task.targets]
         self.params = mi.traverse(task.scene)
@@ -94,10 +95,7 @@ class Plain:
 
     def _apply(self, instead: Mapping[str, Any] | None = None) -> None:
         """Set the scene's parameters, some of them to other values than the optimizer's."""
-        problem, values = (
-            self.task.problem,
-            {**{name: self.optimizer[name] for name in self.optimizer.keys()}, **(instead or {})},
-        )
+        problem, values = self.task.problem, {**dict(self.optimizer.items()), **(instead or {})}
         for name, unknown in problem.unknowns.items():
             if not unknown.shape:
                 self.params[name] = self._decoded(name) if name in self.steps else values[name]
@@ -182,6 +180,8 @@ class Entry:
     begin: Callable[[Task, float, int, int], Loop]
     """Task, learning rate, samples per pixel and seed -> a loop at its initial values."""
     applies: Callable[[Kind], bool] = lambda kind: True
+    warm_up: int = 1
+    """Iterations per training view before the clock starts: kernels are compiled, and those of pathreplay recorded."""
     rated: bool = True
     """Whether it has a learning rate; otherwise only samples are searched."""
 
@@ -204,10 +204,10 @@ def differences(integrator: str) -> Entry:
 
 def own(**options: Any) -> Entry:
     """This project, with options of `Own`."""
-    return Entry(lambda task, rate, spp, seed: Own(task, rate, spp, seed, **options))
+    return Entry(lambda task, rate, spp, seed: Own(task, rate, spp, seed, **options), warm_up=3)
 
 
-STOCK = ("prb", "prbvolpath", "prb_projective")
+STOCK = ("prb", "prbvolpath", "prb_projective", "direct_projective")
 
 #: All ways, by the name that tables give them: an integrator, and what is done with it.
 ENTRIES: dict[str, Entry] = {

@@ -37,6 +37,6 @@ PROBLEMS: dict[str, Kind] = {
     "cloud": Kind(cloud, ("prbvolpath",), has_grid=True, heavy=True),
     "object: albedo and roughness, unknown sky": Kind(object_under_sky, has_grid=True),
     "glass pane: index and normals": Kind(glass, has_grid=True, heavy=True),
-    "mesh by shadows": Kind(mesh, PROJECTIVE, heavy=True),
+    "mesh by shadows": Kind(mesh, (*PROJECTIVE, "direct_projective"), heavy=True),
     "metal fitted by principled": Kind(metal),
 }

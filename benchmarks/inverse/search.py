@@ -17,16 +17,15 @@ MARKS = (1 / 3, 1 / 10, 1 / 30)
 MIDDLE = MARKS[1]
 GROWTH = 2**0.5
 """Ratio of the iterations after which the error is measured."""
-WARM_UP = 3
-"""Iterations per training view before the clock starts: kernels are traced, recorded and compiled in them."""
+LOST = 1e30
+"""Error of values that are not finite; records hold finite numbers only."""
+
+
+Clock = Callable[[], float]
 
 
 def followed(
-    loop: Loop,
-    error: Callable[[Values], float],
-    goal: float,
-    budget: float,
-    clock: Callable[[], float] = time.perf_counter,
+    loop: Loop, error: Callable[[Values], float], goal: float, budget: float, clock: Clock = time.perf_counter
 ) -> Curve:
     """Run a loop until its error is ``goal`` times the initial one or its iterations have taken ``budget`` seconds.
 
@@ -43,13 +42,13 @@ def followed(
         seconds.append(seconds[-1] + clock() - start)
         steps.append(done)
         errors.append(error(values))
-        if not errors[-1] < float("inf"):
-            errors[-1] = float("inf")
+        if not math.isfinite(errors[-1]):
+            errors[-1] = LOST
             break
     return Curve(0.0, 0, 0, tuple(steps), tuple(seconds), tuple(errors))
 
 
-def warmed(loop: Loop, iterations: int, clock: Callable[[], float] = time.perf_counter) -> float:
+def warmed(loop: Loop, iterations: int, clock: Clock = time.perf_counter) -> float:
     """Take iterations and return to the initial values; returns the seconds that this took."""
     start = clock()
     for _ in range(iterations):

@@ -35,6 +35,7 @@ STOCK = (
     "prb",
     "prb_basic",
     "prb_projective",
+    "direct_projective",
     "edge list",
     "projective secondary",
     "unguided secondary",

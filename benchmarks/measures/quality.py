@@ -12,7 +12,7 @@ import numpy as np
 from ..inverse.loops import ENTRIES
 from ..inverse.problem import Task
 from ..inverse.problems import PROBLEMS
-from ..inverse.search import MARKS, MIDDLE, WARM_UP, best, followed, reached, searched, warmed
+from ..inverse.search import MARKS, MIDDLE, best, followed, reached, searched, warmed
 from .job import Curve, Job, Measure
 
 
@@ -65,7 +65,8 @@ class Quality(Measure):
 
     def _followed(self, method: str, rate: float, spp: int, seed: int, goal: float) -> Curve:
         gc.collect()  # scenes and recordings of earlier runs slow down tracing
-        loop = ENTRIES[method].begin(self.task, rate, spp, seed)
-        untimed = warmed(loop, WARM_UP * len(self.task.problem.train))
+        entry = ENTRIES[method]
+        loop = entry.begin(self.task, rate, spp, seed)
+        untimed = warmed(loop, entry.warm_up * len(self.task.problem.train))
         curve = followed(loop, self.task.error, goal, self.job.budget)
         return replace(curve, rate=rate, spp=spp, seed=seed, warm_up=untimed)
