@@ -41,8 +41,7 @@ class Plain:
 
     def __init__(self, task: Task, rate: float, spp: int, seed: int, integrator: str, **adam: Any) -> None:
         self.task, self.rate, self.spp, self.seed, self.adam = task, rate, spp, seed, adam
-        limits = {} if integrator == "direct_projective" else task.problem.limits  # it has no depth
-        self.integrator = mi.load_dict({"type": integrator, **limits})
+        self.integrator = mi.load_dict({"type": integrator, **task.problem.limits})
         self.views = [sensor_index(task.scene, name) for name in task.problem.train]
         self.targets = [mi.TensorXf(target) for target in task.targets]
         self.params = mi.traverse(task.scene)
@@ -207,11 +206,9 @@ def own(**options: Any) -> Entry:
     return Entry(lambda task, rate, spp, seed: Own(task, rate, spp, seed, **options), warm_up=3)
 
 
-STOCK = ("prb", "prbvolpath", "prb_projective", "direct_projective")
-
 #: All ways, by the name that tables give them: an integrator, and what is done with it.
 ENTRIES: dict[str, Entry] = {
-    **{f"{name}, plain loop": plain(name) for name in STOCK},
+    **{f"{name}, plain loop": plain(name) for name in ("prb", "prbvolpath", "prb_projective")},
     "prb, beta_2 = 0.99": plain("prb", beta_2=0.99),
     "path, central difference": differences("path"),
     "pathreplay": own(),

@@ -19,6 +19,7 @@ class Kind:
     integrators: tuple[str, ...] = ("prb",)
     has_grid: bool = False  # textures or volumes among the unknowns
     heavy: bool = False  # takes longer than others
+    pixels: int = 24  # of an edge in a full run
 
     def build(self, pixels: int) -> Problem:
         """Textures and grids have a third more cells along an edge than images have pixels."""
@@ -31,12 +32,12 @@ NO_GRADIENT = ("path",)
 """Central differences, for few numbers."""
 
 PROBLEMS: dict[str, Kind] = {
-    "texture under a sky": Kind(texture, has_grid=True),
+    "texture under a sky": Kind(texture, has_grid=True, pixels=48),
     "camera: pose and focal length": Kind(camera, PROJECTIVE + NO_GRADIENT),
     "room: two lamps, four materials": Kind(room),
     "cloud": Kind(cloud, ("prbvolpath",), has_grid=True, heavy=True),
-    "object: albedo and roughness, unknown sky": Kind(object_under_sky, has_grid=True),
+    "object: albedo and roughness, unknown sky": Kind(object_under_sky, has_grid=True, pixels=48),
     "glass pane: index and normals": Kind(glass, has_grid=True, heavy=True),
-    "mesh by shadows": Kind(mesh, (*PROJECTIVE, "direct_projective"), heavy=True),
+    "mesh by shadows": Kind(mesh, PROJECTIVE, heavy=True),
     "metal fitted by principled": Kind(metal),
 }

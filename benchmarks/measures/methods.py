@@ -35,7 +35,6 @@ STOCK = (
     "prb",
     "prb_basic",
     "prb_projective",
-    "direct_projective",
     "edge list",
     "projective secondary",
     "unguided secondary",

@@ -6,19 +6,19 @@ import math
 import statistics as st
 from collections.abc import Mapping
 
-from ..inverse.loops import STOCK, entries_of
-from ..inverse.problems import NO_GRADIENT, PROBLEMS
+from ..inverse.loops import entries_of
+from ..inverse.problems import PROBLEMS
 from ..inverse.search import MARKS, best, reached
 from ..measures.job import Curve, Job, Point, Record
-from ..measures.methods import parts
+from ..measures.methods import STOCK, parts
 from ..tables import groups, markdown
 
 TITLE = "quality"
-TAKES = (110, 2100)
+TAKES = (110, 1900)
 QUICK = tuple(PROBLEMS)[:4]
 RATES, SAMPLES = (0.001, 0.003, 0.01, 0.03), (4, 32)
 QUICK_RATES, QUICK_SAMPLES = (0.01, 0.03), (8,)
-SECONDS, HEAVY_SECONDS, QUICK_SECONDS = 5.0, 12.0, 1.0
+SECONDS, HEAVY_SECONDS, QUICK_SECONDS = 5.0, 15.0, 1.0
 
 
 def jobs(quick: bool) -> list[Job]:
@@ -30,7 +30,7 @@ def jobs(quick: bool) -> list[Job]:
             methods=entries_of(name),
             max_depth=0,  # see the problem
             rr_depth=0,
-            resolution=18 if quick else 48,
+            resolution=18 if quick else PROBLEMS[name].pixels,
             spp=1,
             rounds=1 if quick else 3,
             warmup=1,
@@ -46,7 +46,7 @@ def jobs(quick: bool) -> list[Job]:
 
 def is_stock(point: Point) -> bool:
     """Whether it is a loop with one of Mitsuba's integrators."""
-    return parts(point.method)[0] in (*STOCK, *NO_GRADIENT)
+    return parts(point.method)[0] in STOCK
 
 
 def runs(point: Point) -> list[Curve]:
