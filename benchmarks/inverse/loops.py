@@ -1,7 +1,8 @@
 """Loops that solve a problem: the one of Mitsuba's tutorials, and that of pathreplay. An iteration uses one view.
 
 Both minimise the mean squared difference by Adam, with the same rates (fractions of a parameter's range), samples and
-bounds. The plain loop takes the views in turn, as the tutorials do; pathreplay has `view_batch_size = 1`.
+bounds. The plain loop takes the views in turn, as the tutorials do; pathreplay has `view_batch_size = 1`. Options of
+Adam are each side's defaults: they differ in beta_2, 0.999 and 0.99.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ class Loop(Protocol):
 class Plain:
     """`mi.render`, a loss, `dr.backward`, Adam and clipping."""
 
-    def __init__(self, task: Task, rate: float, spp: int, seed: int, integrator: str, **adam: Any) -> None:
-        self.task, self.rate, self.spp, self.seed, self.adam = task, rate, spp, seed, adam
+    def __init__(self, task: Task, rate: float, spp: int, seed: int, integrator: str) -> None:
+        self.task, self.rate, self.spp, self.seed = task, rate, spp, seed
         self.integrator = mi.load_dict({"type": integrator, **task.problem.limits})
         self.views = [sensor_index(task.scene, name) for name in task.problem.train]
         self.targets = [mi.TensorXf(target) for target in task.targets]
@@ -51,7 +52,7 @@ class Plain:
         """See `Loop`."""
         unknowns = self.task.problem.unknowns
         smooth = any(unknown.large_steps for unknown in unknowns.values())
-        self.optimizer = mi.ad.Adam(lr=self.rate, uniform=smooth, **self.adam)
+        self.optimizer = mi.ad.Adam(lr=self.rate, uniform=smooth)
         self.steps: dict[str, mi.ad.LargeSteps] = {}
         for name, unknown in unknowns.items():
             start = self.task.initial(name)
@@ -129,11 +130,10 @@ class Own:
     """`pathreplay.init` and `pathreplay.step`."""
 
     def __init__(
-        self, task: Task, rate: float, spp: int, seed: int, optimizer: str = "adam",
-        of_grids: Mapping[str, Any] | None = None, **settings: Any,
-    ) -> None:  # fmt: skip
+        self, task: Task, rate: float, spp: int, seed: int, of_grids: Mapping[str, Any] | None = None, **settings: Any
+    ) -> None:
         self.problem = _problem(task, rate, spp, seed, of_grids or {})
-        self.first = self.state = pathreplay.init(self.problem, optimizer, **{"view_batch_size": 1, **settings})
+        self.first = self.state = pathreplay.init(self.problem, **{"view_batch_size": 1, **settings})
 
     def reset(self) -> None:
         """See `Loop`."""
@@ -181,14 +181,12 @@ class Entry:
     applies: Callable[[Kind], bool] = lambda kind: True
     warm_up: int = 1
     """Iterations per training view before the clock starts: kernels are compiled, and those of pathreplay recorded."""
-    rated: bool = True
-    """Whether it has a learning rate; otherwise only samples are searched."""
 
 
-def plain(integrator: str, **adam: Any) -> Entry:
+def plain(integrator: str) -> Entry:
     """The plain loop with one of Mitsuba's integrators."""
     return Entry(
-        lambda task, rate, spp, seed: Plain(task, rate, spp, seed, integrator, **adam),
+        lambda task, rate, spp, seed: Plain(task, rate, spp, seed, integrator),
         lambda kind: integrator in kind.integrators,
     )
 
@@ -201,17 +199,21 @@ def differences(integrator: str) -> Entry:
     )
 
 
-def own(**options: Any) -> Entry:
-    """This project, with options of `Own`."""
-    return Entry(lambda task, rate, spp, seed: Own(task, rate, spp, seed, **options), warm_up=3)
+def own(of_grids: Mapping[str, Any] | None = None, **settings: Any) -> Entry:
+    """This project, with options of textures and volumes, and settings of `pathreplay.init`."""
+    return Entry(
+        lambda task, rate, spp, seed: Own(task, rate, spp, seed, of_grids or {}, **settings),
+        lambda kind: of_grids is None or kind.has_grid,
+        warm_up=3,
+    )
 
 
 #: All ways, by the name that tables give them: an integrator, and what is done with it.
 ENTRIES: dict[str, Entry] = {
     **{f"{name}, plain loop": plain(name) for name in ("prb", "prbvolpath", "prb_projective")},
-    "prb, beta_2 = 0.99": plain("prb", beta_2=0.99),
     "path, central difference": differences("path"),
     "pathreplay": own(),
+    "pathreplay, pyramid": own(of_grids={"pyramid": True}),
 }
 
 

@@ -30,14 +30,16 @@ class Quality(Measure):
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """Seconds until the middle mark (all seconds of the optimisation, if it is not reached), and the last error."""
         if method in self.curves:
-            choice = best(self.curves[method][: self._points(method)])
+            choice = best([curve for curve in self.curves[method] if curve.searched])
             curve = self._run(method, choice.rate, choice.spp, seed, min(MARKS))
             self.curves[method].append(curve)
             seconds = min(reached(curve, MIDDLE)[0], curve.seconds[-1])
             return seconds, np.array([curve.errors[-1]])
-        start, rates = time.perf_counter(), self._rates(method)
+        start = time.perf_counter()
         found = searched(
-            rates, self.job.samples, lambda rate, spp: self._run(method, rate, spp, self.SEARCH_SEED, MIDDLE)
+            self.job.rates,
+            self.job.samples,
+            lambda rate, spp: self._run(method, rate, spp, self.SEARCH_SEED, MIDDLE),
         )
         self.curves[method] = [replace(curve, searched=True) for curve in found]
         return time.perf_counter() - start, np.array([best(self.curves[method]).errors[-1]])
@@ -48,12 +50,6 @@ class Quality(Measure):
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """All curves, those of the search first."""
         return {name: {"curves": [asdict(curve) for curve in self.curves[name]]} for name in kept}
-
-    def _points(self, method: str) -> int:
-        return len(self._rates(method)) * len(self.job.samples)
-
-    def _rates(self, method: str) -> tuple[float, ...]:
-        return self.job.rates if ENTRIES[method].rated else self.job.rates[:1]
 
     def _run(self, method: str, rate: float, spp: int, seed: int, goal: float) -> Curve:
         try:
