@@ -25,11 +25,12 @@ Clock = Callable[[], float]
 
 
 def followed(
-    loop: Loop, error: Callable[[Values], float], goal: float, budget: float, clock: Clock = time.perf_counter
+    loop: Loop, error: Callable[[Values], float], goal: float, budget: float, clock: Clock = time.process_time
 ) -> Curve:
     """Run a loop until its error is ``goal`` times the initial one or its iterations have taken ``budget`` seconds.
 
-    The error is measured while the clock stands. A value that is not finite ends the run.
+    Seconds are processor time, so that other processes disturb less. The clock stands while the error is measured. A
+    value that is not finite ends the run.
     """
     errors, steps, seconds = [error(loop.values())], [0], [0.0]
     while seconds[-1] < budget and errors[-1] > goal * errors[0]:
@@ -48,7 +49,7 @@ def followed(
     return Curve(0.0, 0, 0, tuple(steps), tuple(seconds), tuple(errors))
 
 
-def warmed(loop: Loop, iterations: int, clock: Clock = time.perf_counter) -> float:
+def warmed(loop: Loop, iterations: int, clock: Clock = time.process_time) -> float:
     """Take iterations and return to the initial values; returns the seconds that this took."""
     start = clock()
     for _ in range(iterations):
@@ -58,13 +59,16 @@ def warmed(loop: Loop, iterations: int, clock: Clock = time.perf_counter) -> flo
     return clock() - start
 
 
-Try = Callable[[float, int], Curve]
+Try = Callable[[float, int, float], Curve]
+"""Learning rate, samples per pixel and seconds -> a run."""
 
 
-def searched(rates: Sequence[float], samples: Sequence[int], run: Try) -> Iterator[Curve]:
-    """Run every point of the grid."""
+def searched(rates: Sequence[float], samples: Sequence[int], run: Try, budget: float) -> Iterator[Curve]:
+    """Run every point of the grid; one that can no longer reach the middle mark first is stopped."""
     for spp, rate in product(samples, rates):
-        yield replace(run(rate, spp), rate=rate, spp=spp)
+        curve = run(rate, spp, budget)
+        budget = min(budget, reached(curve, MIDDLE)[0])
+        yield replace(curve, rate=rate, spp=spp)
 
 
 def best(curves: Sequence[Curve]) -> Curve:

@@ -1,4 +1,4 @@
-"""Task `quality`: seconds and iterations until the held-out error of inverse problems falls below marks."""
+"""Task `quality`: processor seconds and iterations until the held-out error of inverse problems falls below marks."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ..measures.methods import STOCK, parts
 from ..tables import groups, markdown
 
 TITLE = "quality"
-TAKES = (90, 1900)
+TAKES = (90, 1200)
 QUICK = "texture under a sky", "room: two lamps, four materials", "cloud"
 RATES, SAMPLES = (0.001, 0.003, 0.01, 0.03), (4, 32)
 QUICK_RATES, QUICK_SAMPLES = (0.01, 0.03), (8,)
-SECONDS, HEAVY_SECONDS, QUICK_SECONDS = 5.0, 12.0, 1.0
+SECONDS, HEAVY_SECONDS, QUICK_SECONDS = 4.0, 8.0, 1.0
 
 
 def jobs(quick: bool) -> list[Job]:
-    """One job for each problem, whose loops take turns; one thread, so that a machine that does more disturbs less."""
+    """One job for each problem, whose loops take turns, with one thread."""
     return [
         Job(
             scene=name,

@@ -122,9 +122,10 @@ def descended(rate: float, budget: float = 1000, goal: float = 1e-3) -> Curve:
 
 
 def test_the_search_picks_the_rate_that_reaches_the_middle_mark_first() -> None:
-    curves = list(searched((0.01, 0.1), (4, 8), lambda rate, spp: descended(rate * spp / 8)))
+    curves = list(searched((0.01, 0.1), (4, 8), lambda rate, spp, budget: descended(rate * spp / 8, budget), 1000))
     assert [(curve.rate, curve.spp) for curve in curves] == [(0.01, 4), (0.1, 4), (0.01, 8), (0.1, 8)]
     assert (best(curves).rate, best(curves).spp) == (0.1, 8)
+    assert curves[2].seconds[-1] < reached(curves[1], MIDDLE)[0] + 1.01, "it is stopped once it cannot be the best"
     late = [replace(descended(rate, budget=3), rate=rate) for rate in (0.2, 0.3, 0.1)]
     assert {reached(curve, MARKS[1])[0] for curve in late} == {math.inf}
     assert best(late).rate == 0.3, "where none reaches it, the last error decides"
