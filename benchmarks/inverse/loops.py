@@ -150,6 +150,7 @@ class Own:
 
 def _problem(task: Task, rate: float, spp: int, seed: int, of_grids: Mapping[str, Any]) -> pathreplay.Problem:
     problem = task.problem
+    task.restore()  # a derived parameter is computed from its value in the scene
     parameters = {
         name: pathreplay.Parameter(
             initial=task.initial(name) if unknown.shape or isinstance(unknown.initial, np.ndarray) else unknown.initial,

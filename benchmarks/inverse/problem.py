@@ -105,6 +105,12 @@ class Task:
             self.params[key] = made.function(_copied(self.first[key]), *free)
         self.params.update()
 
+    def restore(self) -> None:
+        """Set the scene's parameters to those of the loaded scene, from which derived ones are computed."""
+        for key, value in {**self.stored, **self.first}.items():
+            self.params[key] = _copied(value)
+        self.params.update()
+
     def error(self, values: Values) -> float:
         """The mean over held-out views of the root mean square difference over the root mean square of the target.
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -18,7 +19,7 @@ sys.path.insert(0, str(ROOT))  # the benchmarks run from the checkout and are no
 
 from benchmarks import plots
 from benchmarks.inverse.loops import ENTRIES, Differences, Own, Plain, entries_of
-from benchmarks.inverse.problem import Problem, Task, Unknown
+from benchmarks.inverse.problem import Made, Problem, Task, Unknown
 from benchmarks.inverse.problems import PROBLEMS
 from benchmarks.inverse.search import LOST, MARKS, MIDDLE, best, followed, reached, searched
 from benchmarks.measures.job import Curve, Machine, Point, Record
@@ -93,6 +94,17 @@ def test_the_error_is_zero_at_the_truth_alone(task: Task) -> None:
     truth = np.array([0.2, 0.5, 0.7], np.float32)
     assert task.error({COLOUR: truth}) == pytest.approx(0, abs=1e-6)
     assert task.error({COLOUR: truth + 0.01}) > 1e-3
+
+
+def test_derived_parameters_are_computed_from_the_loaded_scene() -> None:
+    """Not from the values that another loop has left in it."""
+    made = {COLOUR: Made(lambda first, shade: mi.Color3f(first + shade.array), ("shade",))}
+    shaded = Task(replace(tiny(), unknowns={"shade": Unknown(0.2, -0.2, 0.2, (1,))}, derived=made))
+    for loop in (Plain(shaded, 0.01, 16, 0, "prb"), Differences(shaded, 0.01, 16, 0, "path"), Own(shaded, 0.01, 16, 0)):
+        loop.step()
+        assert shaded.error(loop.values()) > 0.01
+    image = Own(shaded, 0.01, 16, 0).problem.render({"shade": [0.0]}, spp=4096)
+    assert image.mean() == pytest.approx(shaded.targets[0].mean(), rel=0.01)
 
 
 # ------------------------------ Search and curves, without rendering ------------------------------
