@@ -29,6 +29,7 @@ from .tasks import (
     iteration,
     media,
     noise,
+    quality,
     scale,
     startup,
     supergrid,
@@ -51,6 +52,7 @@ _TASKS = (
     gridmedium,
     media,
     scale,
+    quality,
 )
 TASKS: dict[str, ModuleType] = {task.TITLE: task for task in _TASKS}
 

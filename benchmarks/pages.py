@@ -22,6 +22,7 @@ PICTURES = {
         "depth-memory": "Peak memory against path length",
     },
     "media": {"media-efficiency": "Efficiency of gradients of media, relative to prbvolpath"},
+    "quality": {"quality-curves": "Held-out error against time"},
     "noise": {"replay-noise": "Error of attached replay against the noise in its Jacobians"},
 }
 

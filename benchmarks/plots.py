@@ -22,7 +22,7 @@ from .measures.estimates import Estimate, Versus, bias_share
 from .measures.job import Point, Record
 from .pages import PICTURES
 from .tables import groups
-from .tasks import depth, media, noise
+from .tasks import depth, media, noise, quality
 
 IMAGES = ROOT / "docs" / "images"
 
@@ -225,6 +225,37 @@ def _finite(point: Point) -> bool:
     return len(point.values) > 0 and bool(np.isfinite(point.values).all())
 
 
+# ------------------------------ Held-out error ------------------------------
+
+
+def _quality_curves(record: Record) -> Figure:
+    """A panel for each problem: three seeds of each loop, and the marks."""
+    problems = {scene: points for (scene, *_), points in groups(record.points).items()}
+    rows = -(-len(problems) // 4)
+    figure = Figure(figsize=(3.6 * min(len(problems), 4), 3.1 * rows), layout="constrained")
+    panels = figure.subplots(rows, min(len(problems), 4), squeeze=False).ravel()
+    for axes in panels[len(problems) :]:
+        axes.set_axis_off()
+    for axes, (scene, points) in zip(panels, problems.items(), strict=False):
+        stock = iter((RED, ORANGE, PINK, BLACK))
+        own = iter((BLUE, SKY, GREEN, GREY))
+        for method, point in points.items():
+            colour, label = next(stock if quality.is_stock(point) else own), method
+            for curve in quality.runs(point):
+                relative = np.array(curve.errors) / curve.errors[0]
+                axes.plot(curve.seconds[1:], relative[1:], color=colour, linewidth=1.1, label=label)
+                label = None
+        for mark in quality.MARKS:
+            axes.axhline(mark, color="#bbbbbb", linewidth=0.7, linestyle="--", zorder=0)
+        axes.set(xscale="log", yscale="log")
+        axes.set_title(scene, fontsize=9)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(fontsize=7, frameon=False, loc="lower left")
+    figure.supxlabel("seconds", fontsize=9)
+    figure.supylabel("held-out error / initial", fontsize=9)
+    return figure
+
+
 # ------------------------------ Parts ------------------------------
 
 
@@ -282,4 +313,5 @@ DRAW: dict[str, Callable[[Record], Figure]] = {
     "depth-memory": _depth_memory,
     "media-efficiency": _media_efficiency,
     "replay-noise": _replay_noise,
+    "quality-curves": _quality_curves,
 }

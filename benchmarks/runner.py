@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .drafts import ROOT, Done, Draft
-from .measures.job import Job, Machine, Point
+from .measures.job import Curve, Job, Machine, Point
 
 WORKER = (sys.executable, "-m", "benchmarks.measures.worker")
 
@@ -153,5 +153,10 @@ def _point(job: Job, method: str, samples: _Samples, peak: float | None) -> Poin
         peak_mib=peak,
         error=samples.error,
         measure=job.measure,
+        curves=tuple(_curve(fields) for fields in facts.pop("curves", ())),
         **facts,
     )
+
+
+def _curve(fields: dict[str, Any]) -> Curve:
+    return Curve(**{name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})

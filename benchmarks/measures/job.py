@@ -25,6 +25,7 @@ Kind = Literal[
     "whole run",  # an optimisation from beginning to end
     "sum",  # a backward pass, and the error of its sum over samples
     "iterations",  # of a job with many views, by this process or by actors
+    "quality",  # whole optimisations: the held-out error against time
 ]
 
 
@@ -57,6 +58,10 @@ class Job:
     # Announce new parameters before each pass, as an optimiser does: majorants are then made anew; this is timed.
     update: bool = False
     reference: str | None = None  # the method whose mean tells how far the means of the others are off
+    # Of optimisations: seconds of each, and the grid that is searched for every method.
+    budget: float = 0
+    rates: tuple[float, ...] = ()
+    samples: tuple[int, ...] = ()
 
     @property
     def passes(self) -> int:
@@ -92,6 +97,20 @@ class Measure(Protocol):
 
 
 @dataclass(frozen=True)
+class Curve:
+    """The held-out error during one optimisation, at some iterations, the first of which is 0."""
+
+    rate: float  # learning rate, as a fraction of the range of each parameter
+    spp: int
+    seed: int
+    steps: tuple[int, ...]
+    seconds: tuple[float, ...]  # of the iterations alone
+    errors: tuple[float, ...]
+    warm_up: float = 0.0  # seconds of the first iterations, in which kernels are compiled, and which are not counted
+    searched: bool = False  # whether it belongs to the search
+
+
+@dataclass(frozen=True)
 class Point:
     """The samples of one method in one job, or the error message of the method."""
 
@@ -118,6 +137,7 @@ class Point:
     values: tuple[float, ...] = ()  # of each seed, where what was measured is one number
     z: float | None = None  # the difference from a reference, in standard errors, where there is one
     verdict: str | None = None  # of task `truth`: see pathreplay.testing.verdict
+    curves: tuple[Curve, ...] = ()  # of task `quality`
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ STOCK = (
     "unguided secondary",
     "prbvolpath",
     "volpath",
+    "path",
     "finite differences",
     "central difference",
     "half steps",

@@ -41,6 +41,7 @@ MEASURES: dict[Kind, tuple[str, str]] = {
     "whole run": ("scale", "WholeRun"),
     "sum": ("scale", "Sum"),
     "iterations": ("actors", "Iterations"),
+    "quality": ("quality", "Quality"),
 }
 
 #: What a process may allocate: a method whose memory grows without bound dies of it before the machine swaps.

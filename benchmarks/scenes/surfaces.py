@@ -44,7 +44,7 @@ def glossy_environment(resolution: int) -> SceneDict:
         "type": "scene",
         "sensor": sensor(resolution, [0, -4.5, 2.2], [0, 0, 0.4], fov=40),
         "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": floor},
-        "environment": {"type": "envmap", "bitmap": mi.Bitmap(_sky()), "to_world": T().rotate([1, 0, 0], 90)},
+        "environment": {"type": "envmap", "bitmap": mi.Bitmap(sky()), "to_world": T().rotate([1, 0, 0], 90)},
     }
     for name, x, alpha in (("left", -1.1, 0.05), ("middle", 0.0, 0.15), ("right", 1.1, 0.3)):
         scene[name] = {
@@ -56,7 +56,7 @@ def glossy_environment(resolution: int) -> SceneDict:
     return scene
 
 
-def _sky() -> np.ndarray:
+def sky() -> np.ndarray:
     """A bluish sky over a dark ground with a warm sun of about 15 degrees, 32 times as bright as the sky."""
     v, u = np.mgrid[0:64, 0:128].astype(np.float32)
     v, u = (v + 0.5) / 64, (u + 0.5) / 128
