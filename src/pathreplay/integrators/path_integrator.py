@@ -124,20 +124,8 @@ class PathIntegrator:
         ``dr.set_grad`` on ``x`` and propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)`` first. Warns like
         `render_backward`.
         """
-        tangent = None
-        for part in parts(self.pass_of(scene, sensor, seed, spp)):
-            state = self.begin(scene)
-            with self._pass_context():
-                part, trace, terms = self._planned(part, state)
-                learned = self._learned(part, trace, state)
-                if part.flow is not None:
-                    part.flow.carry_tangents()
-                result = reduce(add, [term.forward(part, trace, learned) for term in terms])
-                assert result.image is not None
-                tangent = _sum(tangent, result.image, part.share)
-            self._log_notes(part, trace, result)
-            self.keep(scene, state.after(result))
-        assert tangent is not None
+        tangent, state = self.tangent_pass(self.pass_of(scene, sensor, seed, spp), self.begin(scene))
+        self.keep(scene, state)
         return tangent
 
     def render_backward(
@@ -163,6 +151,23 @@ class PathIntegrator:
                 total = _sum(total, image(part, self._trace_config(part.scene, part.sensor, state)), part.share)
         assert total is not None
         return total
+
+    def tangent_pass(self, view: Pass, state: PassState) -> tuple[mi.TensorXf, PassState]:
+        """Compute the tangent of the image from the tangents of the parameters: see `render_forward`."""
+        tangent = None
+        for part in parts(view):
+            with self._pass_context():
+                part, trace, terms = self._planned(part, state)
+                learned = self._learned(part, trace, state)
+                if part.flow is not None:
+                    part.flow.carry_tangents()
+                result = reduce(add, [term.forward(part, trace, learned) for term in terms])
+                assert result.image is not None
+                tangent = _sum(tangent, result.image, part.share)
+            self._log_notes(part, trace, result)
+            state = state.after(result)
+        assert tangent is not None
+        return tangent, state
 
     def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState:
         """Back-propagate an image gradient into the parameters: see `render_backward`."""

@@ -52,6 +52,8 @@ class StatefulIntegrator(Protocol):
 
     def image_pass(self, view: Pass, state: PassState) -> mi.TensorXf: ...
 
+    def tangent_pass(self, view: Pass, state: PassState) -> tuple[mi.TensorXf, PassState]: ...
+
     def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState: ...
 
     def pixel_pass(
@@ -114,6 +116,10 @@ class Stateless:
     def image_pass(self, view: Pass, state: PassState) -> mi.TensorXf:
         with dr.suspend_grad():
             return mi.render(view.scene, sensor=view.sensor, integrator=self.integrator, spp=view.spp, seed=view.seed)
+
+    def tangent_pass(self, view: Pass, state: PassState) -> tuple[mi.TensorXf, PassState]:
+        params = mi.traverse(view.scene)
+        return self.integrator.render_forward(view.scene, params, view.sensor, view.seed, view.spp), state
 
     def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState:
         with dr.isolate_grad():  # preserves the AD graph of scene values for the next pass
