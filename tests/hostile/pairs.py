@@ -132,12 +132,15 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
     **_of("exposure", white_balance=[True], reference=["left"], fix_scale=[False], learning_rate=[0.1]),
     **_of("adaptive_spp", {"spp": "auto"}, target_snr=[0.5], min=[4], max=[16]),
     **_of("optimizer", beta_1=[0.8], beta_2=[0.9], epsilon=[1e-6], uniform=[True], amsgrad=[True]),
-    "optimizer.type": [{"optimizer.type": kind} for kind in ("adamw", "sgd", "rmsprop", "l-bfgs-b")],
+    "optimizer.type": [
+        {"optimizer.type": kind} for kind in ("adamw", "sgd", "rmsprop", "l-bfgs-b", "levenberg-marquardt")
+    ],
     **_of("optimizer", {"optimizer.type": "adamw"}, weight_decay=[0.1]),
     **_of("optimizer", {"optimizer.type": "sgd"}, momentum=[0.5]),
     **_of("optimizer", {"optimizer.type": "sgd", "optimizer.momentum": 0.5}, nesterov=[True]),
     **_of("optimizer", {"optimizer.type": "rmsprop"}, alpha=[0.9]),
     **_of("optimizer", {"optimizer.type": "l-bfgs-b"}, history_size=[3], tolerance=[1e-3]),
+    **_of("optimizer", {"optimizer.type": "levenberg-marquardt"}, damping=[0.1]),
     **_of("preview", share=[0.5], views=[1], frames=[2]),
     **_of("ray", address=["auto"], actors=[1], threads=[1], max_restarts=[1], max_task_retries=[1]),
     **_of("target", images=[["left.exr", "right.exr"], "[lr]*t.exr"], values=[{TEXTURE: 0.6}], spp=[2]),

@@ -193,9 +193,10 @@ def test_scenes_are_objects_dictionaries_files_and_names(photos: list[np.ndarray
         (lambda: mi.ad.Adam(lr=0.03), 0.5),
         (Descent, 0.03),
         ("l-bfgs-b", 0.03),
+        ("levenberg-marquardt", 0.03),
         (partial(scipy.optimize.minimize, method="SLSQP"), 0.03),
     ],
-    ids=["name", "table", "mitsuba", "own", "scipy", "any of scipy"],
+    ids=["name", "table", "mitsuba", "own", "scipy", "second order", "any of scipy"],
 )
 def test_any_optimizer_lowers_the_loss(optimizer: Any, rate: float, photos: list[np.ndarray]) -> None:
     problem = Problem(room(), {WALL: GREY}, views(photos), learning_rate=rate, spp=8)

@@ -97,7 +97,7 @@ def test_the_schema_says_what_a_job_may_be() -> None:
     assert told.exit_code == 0
     assert set(schema["required"]) == {"scene", "parameters"}
     optimizer = schema["$defs"]["Optimizer"]["properties"]
-    assert optimizer["type"]["enum"] == ["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b"]
+    assert optimizer["type"]["enum"] == ["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b", "levenberg-marquardt"]
     assert schema["additionalProperties"] is False
 
 

@@ -11,14 +11,14 @@ from pathreplay.types import Json
 
 
 class Optimizer(Table):
-    """An optimiser of ``drjit.opt`` or SciPy's L-BFGS-B, with its options; None stands for the value in `DEFAULTS`.
+    """An optimiser and its options; None stands for the value in `DEFAULTS`.
 
     The options of Dr.Jit's optimisers keep their names. ``weight_decay`` acts on the optimised variable, which is not
     the value itself if the parameter has a ``parameterization``.
     """
 
-    type: Literal["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b"] = "adam"
-    """Optimiser of drjit.opt, or SciPy's L-BFGS-B."""
+    type: Literal["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b", "levenberg-marquardt"] = "adam"
+    """Optimiser of drjit.opt, SciPy's L-BFGS-B, or Levenberg-Marquardt for up to 200 numbers."""
     beta_1: Share | None = None
     """Decay rate of the first moment (Adam, AdamW)."""
     beta_2: Share | None = None
@@ -40,7 +40,10 @@ class Optimizer(Table):
     history_size: Count | None = None
     """Number of corrections that L-BFGS-B keeps."""
     tolerance: Positive | None = None
-    """Fraction of the initial loss; L-BFGS-B stops when a step lowers the loss by less than that."""
+    """Fraction of the initial loss; L-BFGS-B stops when a step lowers the loss by less than that, and
+    Levenberg-Marquardt when the noise of the values raises the loss by less than that (default: never)."""
+    damping: Positive | None = None
+    """Initial damping of Levenberg-Marquardt, relative to the diagonal of the Gauss-Newton matrix."""
 
     @model_validator(mode="after")
     def _of_its_type(self) -> Optimizer:
@@ -56,8 +59,13 @@ class Optimizer(Table):
 
     @property
     def searches(self) -> bool:
-        """Whether the optimiser compares losses of different iterations. If so, all use the same random numbers."""
-        return self.type == "l-bfgs-b"
+        """Whether the optimiser compares losses of different iterations, which use the same random numbers."""
+        return self.type in ("l-bfgs-b", "levenberg-marquardt")
+
+    @property
+    def is_second_order(self) -> bool:
+        """Whether it needs the Gauss-Newton model of the loss."""
+        return self.type == "levenberg-marquardt"
 
     def options(self) -> Json:
         """Return all options of the type, with defaults for those that are not given."""
@@ -80,4 +88,5 @@ DEFAULTS: dict[str, dict[str, float | bool]] = {
     "rmsprop": {"alpha": 0.99, "epsilon": 1e-8},
     # The tolerance is relative to the initial loss. Smaller decreases are within the rounding error of float32.
     "l-bfgs-b": {"history_size": 10, "tolerance": 1e-6},
+    "levenberg-marquardt": {"damping": 1e-2, "tolerance": 0.0},
 }

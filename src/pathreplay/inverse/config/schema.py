@@ -29,7 +29,7 @@ from pathreplay.platform.files import MISSING, file_problem
 from pathreplay.types import Json
 
 PIXELWISE = ("l2", "relative-l2")
-"""Losses that support pixel batches: the names of the losses in `pixelwise.QUADRATIC`."""
+"""Losses that support pixel batches and Levenberg-Marquardt: the names of the losses in `pixelwise.QUADRATIC`."""
 CORNERED = ("l1", "relative-l1", "smape")
 """Losses whose derivative jumps where image and target are equal."""
 
@@ -318,6 +318,23 @@ class Config(Table):
                     f"optimizer: type = '{self.optimizer.type}' does not step the levels of a pyramid; remove "
                     f"'pyramid' of parameter '{entry.key}', or use 'adam'"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _of_squares(self) -> Config:
+        if not self.optimizer.is_second_order:
+            return self
+        kind = f"optimizer: type = '{self.optimizer.type}'"
+        if self.loss not in PIXELWISE:
+            raise ValueError(
+                f"{kind} needs a sum of squares, which loss = '{self.loss}' is not; use {' or '.join(PIXELWISE)}, or "
+                "type = 'adam'"
+            )
+        if isinstance(self.spp, int) and self.spp % (2 * self.parts):
+            raise ValueError(
+                f"{kind} splits the samples into halves, but spp is {self.spp}; set it to a multiple of "
+                f"{2 * self.parts}"
+            )
         return self
 
     def seeds(self, stream: int, sensor: int, iteration: int = 0, count: int = 2) -> tuple[int, ...]:

@@ -32,6 +32,7 @@ from pathreplay.inverse.loop.events import (
     Stopped,
 )
 from pathreplay.inverse.loop.movement import parts_of
+from pathreplay.inverse.loop.second_order import draw_of, observe
 from pathreplay.inverse.objective.evaluate import (
     Evaluate,
     Evaluation,
@@ -46,6 +47,7 @@ from pathreplay.inverse.objective.evaluate import (
 from pathreplay.inverse.objective.stages import Part, part_at
 from pathreplay.inverse.optim.adaptive import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optim.lbfgs import LineSearch, Search
+from pathreplay.inverse.optim.levenberg_marquardt import LevenbergMarquardt
 from pathreplay.inverse.parameters.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.values import Array, Arrays
@@ -96,6 +98,8 @@ def optimiser_of(problem: Problem, values: Arrays, options: Optimizer, search: S
     if options.searches:
         free = -np.inf, np.inf  # `v.coordinates` already keep values within bounds
         bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}
+        if options.is_second_order and search is None:
+            return LevenbergMarquardt(values, options, bounds)
         return LineSearch(values, options, bounds, search)
     uniform = [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
     return DrJitOptimiser(values, options, uniform)
@@ -211,7 +215,7 @@ def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
     values, events = _refined(part, run.values, position)
     config = part.problem.config
     spp = config.spp if isinstance(config.spp, int) else noise.next_spp(config.adaptive_spp, run.history)
-    shards = _shards(part, i, spp)
+    shards = _shards(part, i, spp, run.optimiser)
     scale = len(part.problem.trained()) / len({shard.views for shard in shards})
     evaluations = run.executor.run(values, shards, run.learned)
     dropped: list[dict[str, int]] = []
@@ -230,6 +234,7 @@ def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
         if key in gradients:
             gradients[key] = gradients[key] + slope
     penalty = sum(value for value, _ in penalties.values())
+    observe(part.problem, run.optimiser, values, evaluation)
     slopes = {key: parts_of(gradient) for key, gradient in gradients.items()}
     norms, sizes = _norms(gradients), {key: gradient.size for key, gradient in gradients.items()}
     release(values)
@@ -265,14 +270,14 @@ def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array
     return {**values, **grids}, [Refined(key, shape) for key, shape in due.items()]
 
 
-def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
+def _shards(part: Part, iteration: int, spp: int, optimiser: Optimiser) -> list[Shard]:
     """Make the shards of an iteration, with `Config.parts` shards per view."""
     config, views = part.problem.config, part.problem.views
-    same = 0 if config.optimizer.searches else iteration
+    draw, second_order = draw_of(optimiser, iteration, config.optimizer.searches)
     return [
-        Shard((n,), spp // config.parts, (seed,), part.number, config.pixel_batch_size)
+        Shard((n,), spp // config.parts, (seed,), part.number, config.pixel_batch_size, second_order)
         for n in batch(list(part.problem.trained()), config.view_batch_size, config.seed, iteration)
-        for seed in config.seeds(ITERATION, views[n].sensor, same, config.parts)
+        for seed in config.seeds(ITERATION, views[n].sensor, draw, config.parts)
     ]
 
 

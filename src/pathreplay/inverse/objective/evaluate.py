@@ -25,9 +25,11 @@ from pathreplay.inverse.objective.frozen import (
     differentiate,
     is_recordable,
 )
+from pathreplay.inverse.objective.jacobian import Jacobians
 from pathreplay.inverse.objective.pixel_batches import Batch, obstacle, refused
 from pathreplay.inverse.parameters.exposures import EXPOSURE, factor_of
 from pathreplay.inverse.parameters.exposures import gradient as exposure_gradient
+from pathreplay.inverse.parameters.gauss_newton import GaussNewton
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem, scene_values, sensor_of
 from pathreplay.platform import memory
@@ -51,6 +53,8 @@ class Shard:
     """Index of the job's stage, which determines targets and trainable variables."""
     pixels: int | None = None
     """Number of random pixels per view; None: all pixels."""
+    second_order: bool = False
+    """Whether the Gauss-Newton model is evaluated as well, from forward passes; see `jacobian`."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,8 @@ class Evaluation:
     """Number of gradient entries that were NaN or infinite in a view and were replaced by zero, by key."""
     learned: Arrays
     """State of the integrator after the shard."""
+    model: GaussNewton | None = None
+    """Gauss-Newton model of the loss, if the shard is of second order."""
 
 
 Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]
@@ -83,6 +89,7 @@ class Total:
         self._sums: dict[str, Array] = {}
         self._known: dict[str, Array] = {}
         self._dropped: Counter[str] = Counter()
+        self._model: GaussNewton | None = None
 
     def add(self, each: Evaluation) -> None:
         """Add an evaluation. In an ``owned`` sum, later additions overwrite the arrays of the first evaluation."""
@@ -94,6 +101,8 @@ class Total:
             self._known[name] = np.add(self._known[name], value) if self._count else value
         self._loss += each.loss
         self._dropped += Counter(each.dropped)
+        if each.model is not None:
+            self._model = each.model if self._model is None else self._model + each.model
         self._owned |= self._count > 0
         self._count += 1
 
@@ -112,7 +121,8 @@ class Total:
             sums = {key: np.multiply(value, np.float32(share), out=self._room(key)) for key, value in sums.items()}
         if self._count > 1:
             known = {name: value / np.float32(self._count) for name, value in known.items()}
-        return Evaluation(self._loss * share, sums, dict(self._dropped), known)
+        model = None if self._model is None else self._model.times(share)
+        return Evaluation(self._loss * share, sums, dict(self._dropped), known, model)
 
 
 def total(evaluations: Iterable[Evaluation], share: float = 1.0, owned: bool = False) -> Evaluation:
@@ -195,6 +205,7 @@ class Evaluator:
         self._learned: Arrays = {}  # State of the integrator after the last evaluation.
         self._at: object = None  # Object that represents this state. Another evaluator may replace it.
         self._begun = False
+        self._jacobians: Jacobians | None = None
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`. Errors and warnings of the integrator are passed to the caller."""
@@ -206,7 +217,10 @@ class Evaluator:
         def each() -> Iterator[Evaluation]:
             for view, seed in zip(shard.views, shard.seeds, strict=True):
                 self._know(learned)
-                yield self._view(values, view, seed, shard.samples, shard.pixels)
+                if shard.second_order:
+                    yield self._second_order(values, view, seed, shard.samples)
+                else:
+                    yield self._view(values, view, seed, shard.samples, shard.pixels)
 
         return total(each(), owned=True)
 
@@ -217,6 +231,21 @@ class Evaluator:
             return
         self.integrator.load_state_dict(self.problem.scene, learned)
         self._learned, self._at = learned, self.integrator.baseline
+
+    def _second_order(self, values: Arrays, view: int, seed: int, spp: int) -> Evaluation:
+        """Evaluate a view by forward passes."""
+        sensor_of(self.problem, self.problem.views[view])
+        if self._jacobians is None:
+            self._jacobians = Jacobians(self.problem, self.integrator, self._moving, self.freezes)
+        try:
+            with plain_errors():
+                loss, gradients, dropped, model = self._jacobians.model(values, view, seed, spp)
+        except NotRecordable:
+            self.freezes = self._jacobians.freezes = False
+            return self._second_order(values, view, seed, spp)
+        release(values)
+        self._learned, self._at = self.integrator.state_dict(), self.integrator.baseline
+        return Evaluation(loss, gradients, dropped, self._learned, model)
 
     def _view(self, values: Arrays, view: int, seed: int, spp: int, pixels: int | None) -> Evaluation:
         about = self.problem.views[view]

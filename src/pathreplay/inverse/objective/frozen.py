@@ -99,7 +99,7 @@ class Recordings:
     """Frozen versions of `differentiate`, by view, shapes of the parameters, and constants of the kernels."""
 
     def __init__(self) -> None:
-        self._frozen: dict[Hashable, Callable[..., ViewResult]] = {}
+        self._frozen: dict[Hashable, Callable[..., Any]] = {}
         self._made: Counter[Hashable] = Counter()  # recordings by view and shapes
 
     def differentiate(
@@ -115,15 +115,30 @@ class Recordings:
         keys = list(params.keys())
         # One function per view, because Dr.Jit warns about functions that are recorded often.
         view = (request.sensor, *(dr.shape(params[key]) for key in keys))
+        state = integrator.begin(scene).to_record()
+        return self.called(view, lambda: _recording(keys), scene, integrator, state, request, target, loss)
+
+    def called(self, view: Hashable, make: Callable[[], Callable[..., Any]], scene: mi.Scene, *args: Any) -> Any:
+        """Call a frozen function of a scene.
+
+        Args:
+            view: identifies the function.
+            make: creates the function; called once for each set of the scene's constants.
+            scene: its first argument.
+            *args: further arguments.
+
+        Raises:
+            NotRecordable: a plugin of the scene prevents the recording, or the constants changed too often.
+        """
         which = view, facts_of(scene).constants()
         if which not in self._frozen:
             self._made[view] += 1
             if self._made[view] > MOST_RECORDINGS:
                 raise NotRecordable
             gc.collect()  # otherwise Dr.Jit also traces scenes that are no longer in use
-            self._frozen[which] = _recording(keys)
+            self._frozen[which] = make()
         try:
-            return self._frozen[which](scene, integrator, integrator.begin(scene).to_record(), request, target, loss)
+            return self._frozen[which](scene, *args)
         except RuntimeError as error:
             if _RECORDING not in str(error):
                 raise

@@ -42,4 +42,8 @@ class JointEvaluator:
         gradients = {key: np.zeros_like(value) for key, value in values.items() if key not in found.gradients}
         gradients |= {key: share * gradient for key, gradient in found.gradients.items()}
         after = {**known, **{f"{n}:{name}": array for name, array in found.learned.items()}}
-        return Evaluation(found.loss / len(self._parts), gradients, found.dropped, after)
+        model = None
+        if found.model is not None:
+            sizes = {v.key: values[v.key].size for v in self._problem.variables}
+            model = found.model.within(sizes).times(1 / len(self._parts))
+        return Evaluation(found.loss / len(self._parts), gradients, found.dropped, after, model)

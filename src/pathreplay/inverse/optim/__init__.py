@@ -1,1 +1,1 @@
-"""Optimisers: first-order optimisers of Dr.Jit, and SciPy's L-BFGS-B."""
+"""Optimisers: first-order optimisers of Dr.Jit, SciPy's L-BFGS-B, and Levenberg-Marquardt."""

@@ -107,6 +107,16 @@ def gradient(values: Arrays, view: int, by_log: Array) -> Array:
     return by_factors
 
 
+def derivatives_by_factors(values: Arrays, view: int, picture: Image) -> Array:
+    """Return the derivatives of the exposed image of a view by all entries of the variable, one image per entry."""
+    rows = values[EXPOSURE]
+    found = np.zeros((*rows.shape, *picture.shape), np.float32)
+    colours = picture.shape[2] - (picture.shape[2] in (2, 4))
+    for channel in range(colours):
+        found[view, channel if rows.shape[1] > 1 else 0, :, :, channel] = picture[:, :, channel]
+    return found.reshape(-1, *picture.shape)
+
+
 def fitted(picture: Image, target: Image, weight: Image | None, each: bool) -> Array:
     """Fit factors on an image to its target by least squares: one per colour if ``each``, or one for all colours."""
     colours = picture.shape[2] - (picture.shape[2] in (2, 4))

@@ -1,0 +1,155 @@
+"""Forward passes of a view: its image and the derivatives by every entry of the variables, in two independent halves.
+
+Each entry takes one forward pass per half, with the random numbers of the image of that half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.integrators.pass_state import PassState
+from pathreplay.integrators.stateful import StatefulIntegrator
+from pathreplay.inverse.objective.frozen import Recordings, RenderRequest, linear_derivative
+from pathreplay.inverse.parameters.exposures import EXPOSURE, derivatives_by_factors, factor_of
+from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Half, Matrix, model_of
+from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.problem.problem import Problem, scene_values
+from pathreplay.platform import memory
+
+IMAGE = ""
+"""Stands for the image itself among the keys of the variables."""
+
+
+class Jacobians:
+    """Differentiates the images of a problem by the variables ``moving``; the scene keeps the values.
+
+    Args:
+        problem: the problem, with a quadratic loss.
+        integrator: integrator of the problem.
+        moving: keys of the variables.
+        record: whether passes are recorded as frozen functions.
+    """
+
+    def __init__(self, problem: Problem, integrator: StatefulIntegrator, moving: Collection[str], record: bool) -> None:
+        self.problem, self.integrator, self.freezes = problem, integrator, record
+        self._recordings = Recordings()
+        self._traced: set[tuple[str, int]] = set()  # by variable, or IMAGE, and view
+        self._moving = [v.key for v in problem.variables if v.key in moving]
+        self._reached = {key: problem.reached(frozenset({key})) if key != EXPOSURE else set() for key in self._moving}
+
+    def model(
+        self, values: Arrays, view: int, seed: int, spp: int
+    ) -> tuple[float, dict[str, Array], dict[str, int], GaussNewton]:
+        """Compute the view's contribution to the loss, its gradients, dropped entries, and the Gauss-Newton model.
+
+        Args:
+            values: values of all variables.
+            view: index of the view.
+            seed: seed of the view.
+            spp: samples per pixel, half of them for each image and each of its derivatives.
+
+        Raises:
+            NotRecordable: a plugin of the scene prevents Dr.Jit from recording a pass.
+            PathreplayError: the derivatives do not fit into memory.
+        """
+        about = self.problem.views[view]
+        sizes = {key: values[key].size for key in self._moving}
+        memory.require(
+            12 * sum(sizes.values()) * about.target.size,
+            f"The derivatives of view '{about.name}' by {sum(sizes.values())} entries",
+            "use fewer parameters or smaller films",
+        )
+        seeds = [int(s) for s in np.random.SeedSequence([seed]).generate_state(2)]
+        opaque = [dr.opaque(mi.UInt32, half) if self.freezes else half for half in seeds]  # see `Evaluator`
+        a, b = (self._half(values, view, RenderRequest(about.sensor, half, spp // 2)) for half in opaque)
+        dropped = {}
+        begin = 0
+        for key, size in sizes.items():
+            lost = 0
+            for rows in zip(a.jacobian[begin : begin + size], b.jacobian[begin : begin + size], strict=True):
+                finite = np.isfinite(rows[0]) & np.isfinite(rows[1])
+                lost += not finite.all()
+                for row in rows:
+                    row[~finite] = 0
+            if lost:
+                dropped[key] = lost
+            begin += size
+        share = about.share / len(self.problem.trained())
+        weight = None if about.weight is None else mi.TensorXf(about.weight)
+        slope = np.array(linear_derivative(self.problem.loss, mi.TensorXf(about.target), weight)[1]) * share
+        loss, gradient, model = model_of(a, b, np.broadcast_to(slope, about.target.shape), sizes)
+        return loss, self._split(values, gradient), dropped, model
+
+    def _split(self, values: Arrays, gradient: Matrix) -> dict[str, Array]:
+        parts = np.split(gradient, np.cumsum([values[key].size for key in self._moving])[:-1])
+        return {
+            key: part.astype(np.float32).reshape(values[key].shape)
+            for key, part in zip(self._moving, parts, strict=True)
+        }
+
+    def _half(self, values: Arrays, view: int, request: RenderRequest) -> Half:
+        """Render the image of a view, and its derivatives by all entries."""
+        target = self.problem.views[view].target
+        factor = factor_of(values, view, target.shape[2])
+        variables = self.problem.cache.variables(self.problem, values)
+        self.problem.params.update(scene_values(self.problem, variables))
+        image = self._pass(IMAGE, view, request)
+        n = sum(values[key].size for key in self._moving)
+        jacobian, row = np.zeros((n, *target.shape), np.float32), 0
+        by_key = {v.key: v for v in self.problem.variables}
+        try:
+            for key in self._moving:
+                size = values[key].size
+                if key == EXPOSURE:
+                    jacobian[row : row + size] = derivatives_by_factors(values, view, image)
+                elif view in self._reached[key]:
+                    for k in range(size):
+                        unit = np.zeros(values[key].shape, np.float32)
+                        unit.flat[k] = 1
+                        self._carry(variables, key, by_key[key].held(unit))
+                        found = self._pass(key, view, request)
+                        jacobian[row + k] = found if factor is None else found * factor
+                row += size
+        finally:
+            dr.disable_grad(variables)
+            self.problem.params.update(scene_values(self.problem, variables))
+        return Half((image if factor is None else image * factor) - target, jacobian)
+
+    def _carry(self, variables: dict[str, dr.ArrayBase], key: str, unit: dr.ArrayBase) -> None:
+        """Attach one variable, and propagate a tangent from it to the scene."""
+        dr.disable_grad(variables)
+        dr.enable_grad(variables[key])
+        dr.set_grad(variables[key], unit)
+        self.problem.params.update(scene_values(self.problem, variables))
+        dr.forward_from(variables[key], dr.ADFlag.ClearEdges)
+
+    def _pass(self, key: str, view: int, request: RenderRequest) -> Array:
+        """Render the tangent that a variable carries, or the image; from the second time on in a recorded pass."""
+        scene, integrator, run = self.problem.scene, self.integrator, _image if key == IMAGE else _tangent
+        state = integrator.begin(scene)
+        # The first call is not recorded: see `Evaluator`.
+        if self.freezes and (key, view) in self._traced:
+            which = key, request.sensor, request.spp
+            arguments = scene, integrator, state.to_record(), request
+            image, state = self._recordings.called(which, lambda: dr.freeze(run), *arguments)
+        else:
+            image, state = run(scene, integrator, state, request)
+        self._traced.add((key, view))
+        integrator.keep(scene, state)
+        return np.array(image, np.float32)
+
+
+def _image(
+    scene: mi.Scene, integrator: StatefulIntegrator, state: PassState, request: RenderRequest
+) -> tuple[mi.TensorXf, PassState]:
+    return integrator.image_pass(integrator.pass_of(scene, request.sensor, request.seed, request.spp), state), state
+
+
+def _tangent(
+    scene: mi.Scene, integrator: StatefulIntegrator, state: PassState, request: RenderRequest
+) -> tuple[mi.TensorXf, PassState]:
+    return integrator.tangent_pass(integrator.pass_of(scene, request.sensor, request.seed, request.spp), state)

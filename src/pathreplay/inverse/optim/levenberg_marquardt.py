@@ -1,0 +1,321 @@
+"""Levenberg-Marquardt steps on noisy Gauss-Newton models: a search on common random numbers, then averaging.
+
+*Search.* All evaluations use the same random numbers, so that losses can be compared. A step solves
+(H + λ diag H) δ = -g within the bounds. It is rejected if the loss grows by more than the noise along the step,
+√(δᵀΣδ), with the covariance Σ of the gradient. λ falls after good steps and grows after rejected ones.
+
+*Averaging.* The noise of g displaces the minimum by H⁻¹Σ^½, which raises the loss by ν = ½ tr(H⁻¹Σ) on average. When a
+step promises less than a fraction of ν, or steps do not lower the loss beyond its noise, further evaluations use fresh
+random numbers. The k-th of them takes the step 2 δ / (k + 2) with the mean of all H. The values then are a mean
+of the minima of all evaluations in which later ones count more, and their error falls like 1/√k, 15 % above that of the
+plain mean, which would forget the result of a search only like 1/k. If the minimum is far away twice in succession, the
+search begins again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.optimizer_options import Optimizer
+from pathreplay.inverse.optim.adaptive import State
+from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Matrix
+from pathreplay.inverse.parameters.values import Array, Arrays
+
+MOST = 200
+"""Largest number of entries; each takes two forward passes per view and iteration."""
+CONVERGED, NEAR = 0.25, 4.0
+"""Multiples of ν: a step that promises less than the first ends the search, and so does one that promises less than the
+second and does not lower the loss beyond its noise."""
+STALLED = 6
+"""Number of successive rejections, or of successive steps that change the loss by less than its noise, after which no
+step is expected to lower it."""
+OUTLIER, FAR = 9.0, 25.0
+"""Multiples of ν: steps of averaging that promise more than the first are shortened, those above the second suggest
+that the minimum has not been found."""
+RESTARTS = 3
+"""Largest number of searches that begin again, in case that the noise is underestimated."""
+GOOD, POOR = 0.75, 0.25
+"""Ratios of the actual to the predicted decrease of the loss, above which λ falls, and below which it grows."""
+FALL, RISE = 0.1, 2.0
+LEAST, MOST_DAMPING = 1e-9, 1e9
+LARGEST = 4.0
+"""Largest ratio of H to the robust matrix: noise lowers the latter less than that."""
+SIGNAL = 1e-3
+"""Ratio of the robust matrix to the bias below which an entry does not move."""
+EFFECT = 10.0
+"""Largest predicted effect of a step on the mean image, relative to the loss: a Gauss-Newton step has at most 1, unless
+it follows an outlier of the gradient."""
+ROUNDING = 1e-6
+"""Relative error of losses in single precision."""
+
+_CONTROLS = "loss", "excess", "damping", "growth", "predicted", "first"
+_COUNTS = "rejections", "stalls", "count", "far", "restarts", "draw", "ended"
+_ARRAYS = "at", "gradient", "matrix", "robust", "bias", "noise", "spread"
+_NAMES = {name: f"levenberg:{name}" for name in (*_ARRAYS, "numbers", "next")}
+REASON = "the noise of the values affects the loss less than the tolerance"
+
+
+@dataclass(frozen=True)
+class Point:
+    """An evaluation: flat values, loss without the variance of images, gradient and model."""
+
+    at: Matrix
+    loss: float
+    gradient: Matrix
+    model: GaussNewton
+
+
+class LevenbergMarquardt:
+    """Levenberg-Marquardt with bounds, as an `Optimiser`: `observe` has to precede each `step`.
+
+    Learning rates have no effect.
+
+    Args:
+        values: initial values by key.
+        options: options of the optimiser.
+        bounds: lower and upper bound of each variable, by key.
+
+    Raises:
+        PathreplayError: there are more than `MOST` entries.
+    """
+
+    def __init__(self, values: Arrays, options: Optimizer, bounds: Mapping[str, tuple[float, float]]) -> None:
+        self._shapes = {key: value.shape for key, value in values.items()}
+        self._sizes = {key: value.size for key, value in values.items()}
+        self._n = sum(self._sizes.values())
+        if self._n > MOST:
+            raise PathreplayError(
+                f"The parameters have {self._n} entries, but optimizer type = '{options.type}' takes up to {MOST}; "
+                "use 'adam' or 'l-bfgs-b'"
+            )
+        given = options.options()
+        self._initial, self._tolerance = float(given["damping"]), float(given["tolerance"])  # type: ignore[arg-type]
+        ends = [np.broadcast_to(np.array(bounds[key], float), (value.size, 2)) for key, value in values.items()]
+        self._low, self._high = np.concatenate(ends).T
+        self._model: GaussNewton | None = None
+        self._reset()
+
+    def _reset(self) -> None:
+        self.finished = ""
+        self.draw = 0
+        """Which random numbers the next evaluation uses: equal numbers in the search, new ones afterwards."""
+        self._steps = 0
+        self._base: Point | None = None
+        self._next = np.zeros(self._n)
+        self._damping, self._growth, self._rejections, self._stalls = self._initial, RISE, 0, 0
+        self._predicted = 0.0
+        self._count, self._far, self._restarts, self._first = 0, 0, 0, 0.0
+
+    def observe(self, model: GaussNewton) -> None:
+        """Receive the model of the loss at the values of the next `step`, in the order of its gradients."""
+        self._model = model
+
+    def step(
+        self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
+    ) -> dict[str, Array]:
+        """See `Optimiser`; returns the next point to evaluate."""
+        model, self._model = self._model, None
+        assert model is not None, "observe() has to precede step()"
+        at, gradient = (np.concatenate([a[key].ravel() for key in values]) for a in (values, gradients))
+        at, gradient = at.astype(np.float64), gradient.astype(np.float64)
+        seen = Point(at, loss - model.excess, gradient, model)
+        self._steps += 1
+        if self.finished:
+            return self.answer()
+        if self._count:
+            self._average(seen)
+        else:
+            self._search(seen)
+        return self._split(self._next)
+
+    def _search(self, seen: Point) -> None:
+        """Accept or reject a step on common random numbers, and propose the next one."""
+        lowered = True
+        if self._base is None:
+            self._base, self._first = seen, self._first or abs(seen.loss)
+        else:
+            lowered = self._judge(self._base, seen)
+        base = self._base
+        step, promise = self._solved(base, LEAST)
+        usual, rounding = self._excess(base.model), ROUNDING * abs(base.loss)
+        if promise <= CONVERGED * usual + rounding:
+            self._begin_averaging(base.at + step, LEAST)
+        elif (promise <= NEAR * usual and not lowered) or self._stalls == STALLED:
+            self._begin_averaging(base.at, LEAST)
+        elif self._rejections == STALLED:  # the model is not to be trusted without damping
+            self._begin_averaging(base.at, self._damping)
+        else:
+            step, self._predicted = self._solved(base, self._damping)
+            self._next = base.at + step
+
+    def _judge(self, base: Point, seen: Point) -> bool:
+        """Accept or reject a step and adapt the damping; returns whether it lowered the loss beyond its noise."""
+        moved, gain = seen.at - base.at, base.loss - seen.loss
+        noise = math.sqrt(max(float(moved @ base.model.noise @ moved), 0.0)) + ROUNDING * abs(base.loss)
+        self._stalls = self._stalls + 1 if abs(gain) <= noise else 0
+        if gain >= -noise:
+            self._base, self._rejections, self._growth = seen, 0, RISE
+            if gain > GOOD * self._predicted:
+                self._damping *= FALL
+            elif gain < POOR * self._predicted - noise:
+                self._damping *= RISE
+        else:
+            self._rejections += 1
+            self._damping = max(self._damping, self._initial) * self._growth
+            self._growth *= RISE
+        self._damping = float(np.clip(self._damping, LEAST, MOST_DAMPING))
+        return gain > noise
+
+    def _begin_averaging(self, at: Matrix, damping: float) -> None:
+        self._count, self._far, self._next, self.draw, self._damping = 1, 0, at, self._steps, damping
+        self._end()
+
+    def _average(self, seen: Point) -> None:
+        """Take a step that averages over the random numbers of all evaluations since the search."""
+        assert self._base is not None
+        share = 2 / (self._count + 2)
+        model = self._base.model.times(1 - share) + seen.model.times(share)
+        # Of covariances the mean is wanted, not that of the mean.
+        noise = self._base.model.noise * (1 - share) + seen.model.noise * share
+        point = replace(seen, model=replace(model, noise=noise))
+        step, promise = self._solved(point, self._damping)
+        usual = self._excess(point.model)
+        self._far = self._far + 1 if promise > FAR * usual + ROUNDING * self._first else 0
+        if self._far == 2 and self._restarts < RESTARTS:
+            self._restarts += 1
+            self._base, self._count, self._far = None, 0, 0
+            self._damping, self._growth, self._rejections, self._stalls = self._initial, RISE, 0, 0
+            self._search(seen)
+            return
+        if promise > OUTLIER * usual > 0:
+            step *= math.sqrt(OUTLIER * usual / promise)
+        self._count += 1
+        self._base = point
+        self._next = seen.at + share * step
+        self.draw = self._steps
+        self._end()
+
+    def _end(self) -> None:
+        """Finish if the noise of the values affects the loss less than the tolerance."""
+        assert self._base is not None
+        if self._tolerance and self._excess(self._base.model) / self._count < self._tolerance * self._first:
+            self.finished = REASON
+
+    def _solved(self, point: Point, damping: float) -> tuple[Matrix, float]:
+        """Return the step within the bounds, and the decrease of the loss that the model predicts.
+
+        Entries that reach a bound are held there, and the others are solved for again.
+        """
+        model = _positive(point.model)
+        damped = model + damping * np.diag(_scale(point.model))
+        free = _scale(point.model) > 0
+        step = np.zeros(self._n)
+        for _ in range(self._n + 1):
+            if not free.any():
+                break
+            right = -point.gradient[free] - damped[np.ix_(free, ~free)] @ step[~free]
+            step[free] = np.linalg.solve(damped[np.ix_(free, free)], right)
+            aim = point.at + step
+            beyond = free & ((aim < self._low) | (aim > self._high))
+            if not beyond.any():
+                break
+            step[beyond] = (np.clip(aim, self._low, self._high) - point.at)[beyond]
+            free &= ~beyond
+        effect = 0.5 * float(step @ (point.model.robust + point.model.bias) @ step)
+        most = EFFECT * (abs(point.loss) + point.model.excess)
+        if effect > most:
+            step *= math.sqrt(most / effect)
+        return step, float(-point.gradient @ step - 0.5 * step @ model @ step)
+
+    def _excess(self, model: GaussNewton) -> float:
+        """Return ν, by which the noise of one evaluation raises the loss at the minimum on average."""
+        free = _scale(model) > 0
+        some = np.ix_(free, free)
+        return 0.5 * float(np.trace(np.linalg.solve(_positive(model)[some], model.noise[some])))
+
+    def _split(self, x: Matrix) -> dict[str, Array]:
+        parts = np.split(x, np.cumsum(list(self._sizes.values()))[:-1])
+        return {
+            key: part.astype(np.float32).reshape(shape)
+            for (key, shape), part in zip(self._shapes.items(), parts, strict=True)
+        }
+
+    def answer(self) -> dict[str, Array]:
+        """Return the last accepted point of a search; empty before the first step and while averaging."""
+        if self._base is None or (self._count and not self.finished):
+            return {}
+        return self._split(self._next if self._count else self._base.at)
+
+    def state(self) -> State:
+        """See `Optimiser`; the state is the last accepted evaluation, and the numbers that control the steps."""
+        steps = dict.fromkeys(self._shapes, self._steps)
+        if self._base is None:
+            return State(steps, {})
+        model = self._base.model
+        controls = self._base.loss, model.excess, self._damping, self._growth, self._predicted, self._first
+        counts = self._rejections, self._stalls, self._count, self._far, self._restarts, self.draw, bool(self.finished)
+        matrices = model.matrix, model.robust, model.bias, model.noise
+        arrays = (self._base.at, self._base.gradient, *matrices, model.spread)
+        named = dict(zip(_NAMES, (*arrays, np.array([*controls, *counts], float), self._next), strict=True))
+        return State(steps, {_NAMES[name]: array for name, array in named.items()})
+
+    def restore(self, state: State, values: Arrays) -> None:
+        """See `Optimiser`."""
+        (count,) = {state.steps[key] for key in values} or {0}
+        if {key: value.shape for key, value in values.items()} != self._shapes:
+            raise ValueError("the shapes of its parameters differ")
+        if rest := set(state.arrays) - set(_NAMES.values()):
+            raise ValueError(f"'{min(rest)}' is not a state array of this optimizer")
+        self._reset()
+        self._steps = count
+        if not count:
+            return
+        n = self._n
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_NAMES, (n,))
+        shapes |= dict.fromkeys(("matrix", "robust", "bias", "noise"), (n, n))
+        shapes["numbers"] = (len(_CONTROLS + _COUNTS),)
+        for name, full in _NAMES.items():
+            array = state.arrays[full]
+            if array.shape != shapes[name] or array.dtype != np.float64:
+                raise ValueError(f"'{full}' is {array.dtype} of shape {array.shape}, not float64 of {shapes[name]}")
+        saved = {name: np.array(state.arrays[full], np.float64) for name, full in _NAMES.items()}
+        loss, excess, self._damping, self._growth, self._predicted, self._first = saved["numbers"][
+            : len(_CONTROLS)
+        ].tolist()
+        counts = saved["numbers"][len(_CONTROLS) :].astype(int).tolist()
+        self._rejections, self._stalls, self._count, self._far, self._restarts, self.draw, ended = counts
+        if self._damping <= 0:
+            raise ValueError("its damping is not positive")
+        self.finished = REASON if ended else ""
+        matrix, robust, bias, noise, spread = (saved[name] for name in _ARRAYS[2:])
+        model = GaussNewton(self._sizes, matrix, robust, bias, noise, spread, excess)
+        self._base = Point(saved["at"], loss, saved["gradient"], model)
+        self._next = saved["next"]
+
+
+def _positive(model: GaussNewton) -> Matrix:
+    """Return H, raised where it is within its own noise, as far as its diagonal tells, and lowered at outliers.
+
+    Both are relative to the robust matrix.
+    """
+    scale = _scale(model)
+    used = scale > 0
+    back = np.where(used, np.sqrt(scale), 0)
+    unit = np.where(used, 1 / np.where(used, back, 1), 0)
+    robust = model.robust * np.outer(unit, unit) + LEAST * np.eye(len(unit))
+    least = min(1.0, max(LEAST, math.sqrt(float((model.spread * unit**4).max()))))
+    ratios, vectors = scipy.linalg.eigh(model.matrix * np.outer(unit, unit), robust)
+    dual = robust @ vectors
+    return (dual * np.clip(ratios, least, LARGEST)) @ dual.T * np.outer(back, back)
+
+
+def _scale(model: GaussNewton) -> Matrix:
+    """Return the diagonal of the robust matrix, or zero for entries whose derivative is nothing but noise."""
+    diagonal, noise = np.diag(model.robust), np.diag(model.bias)
+    return np.where(diagonal > SIGNAL * noise, diagonal, 0)

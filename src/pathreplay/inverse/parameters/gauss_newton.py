@@ -1,0 +1,187 @@
+"""The Gauss-Newton model of a loss that sums weighted squares: its matrix, and the noise of matrix and gradient.
+
+With residuals r = I - T, weights W and the Jacobian J = ∂I/∂v, the loss is ½ rᵀWr, its gradient g = JᵀWr and the
+Gauss-Newton matrix H = JᵀWJ. Two halves a and b of the samples estimate all three without robust:
+
+    ½ r_aᵀ W r_b,      g = ½ (J_aᵀ W r_b + J_bᵀ W r_a),      H = ½ (J_aᵀ W J_b + J_bᵀ W J_a).
+
+Within one half, the products would contain the variance of I, the covariance of J and I, and the variance of J. These
+cancel in differences: the covariance of ½ (J_aᵀ W r_a - J_bᵀ W r_b) is that of g, up to products of noise with noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathreplay.inverse.images.io import Image
+from pathreplay.inverse.parameters.values import Array
+
+Matrix = NDArray[np.float64]
+TILE = 4
+"""Width of the square tiles of pixels whose noise counts as independent: wider than the usual filters."""
+DIFFERENCE = 1e-2
+"""Step of the numerical derivative of a regularizer's gradient, relative to the value, and the smallest value."""
+_AT_ONCE = 2**22
+"""Number of derivatives that are converted to double precision at once."""
+
+
+@dataclass(frozen=True)
+class Half:
+    """Image and Jacobian of a view, from one half of the samples."""
+
+    residual: Image
+    """Image minus target, height x width x channels."""
+    jacobian: Array
+    """Derivative of the image by each of n entries, n x height x width x channels."""
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """The model of a loss in all entries of its variables. Sums of losses have the sum of their models."""
+
+    sizes: dict[str, int]
+    """Number of entries of each variable, in their order."""
+    matrix: Matrix
+    """H, symmetric; unrobusted, and therefore not always positive."""
+    robust: Matrix
+    """Like H, from what both halves agree on: the smaller derivative of a pixel, or zero if the signs differ. Positive
+    semidefinite; outliers of one half have no effect, but the noise of both adds to it."""
+    bias: Matrix
+    """What the noise of J would add to H if both factors came from the mean of the halves; positive semidefinite."""
+    noise: Matrix
+    """Covariance of the gradient."""
+    spread: Matrix
+    """Variance of the diagonal of H, as far as the noise of J alone causes it; outliers dominate it."""
+    excess: float
+    """Expected contribution of the noise of I to the loss of the mean image."""
+
+    def __add__(self, other: GaussNewton) -> GaussNewton:
+        names = "matrix", "robust", "bias", "noise", "spread", "excess"
+        return replace(self, **{name: getattr(self, name) + getattr(other, name) for name in names})
+
+    def times(self, share: float) -> GaussNewton:
+        """Return the model of ``share`` times the loss."""
+        square = share * share
+        return GaussNewton(
+            self.sizes,
+            self.matrix * share,
+            self.robust * share,
+            self.bias * share,
+            self.noise * square,
+            self.spread * square,
+            self.excess * share,
+        )
+
+    def within(self, sizes: Mapping[str, int]) -> GaussNewton:
+        """Return the model in more variables, on which the loss does not depend."""
+        ends = dict(zip(sizes, np.cumsum(list(sizes.values())), strict=True))
+        at = np.concatenate([np.arange(ends[key] - n, ends[key]) for key, n in self.sizes.items()])
+        n = sum(sizes.values())
+        (matrix, robust, bias, noise), spread = np.zeros((4, n, n)), np.zeros(n)
+        for whole, part in ((matrix, self.matrix), (robust, self.robust), (bias, self.bias), (noise, self.noise)):
+            whole[np.ix_(at, at)] = part
+        spread[at] = self.spread
+        return GaussNewton(dict(sizes), matrix, robust, bias, noise, spread, self.excess)
+
+    def curved(self, key: str, matrix: Matrix) -> GaussNewton:
+        """Add the curvature of a regularizer of one variable."""
+        before = 0
+        for name, n in self.sizes.items():
+            if name == key:
+                here = slice(before, before + n)
+                total, robust = self.matrix.copy(), self.robust.copy()
+                total[here, here] += matrix
+                robust[here, here] += matrix
+                return replace(self, matrix=total, robust=robust)
+            before += n
+        return self
+
+    def mapped(self, gradients: Mapping[str, Callable[[Array], Array]]) -> GaussNewton:
+        """Return the model in other coordinates.
+
+        Args:
+            gradients: by key of a variable, the linear map of gradients to the new coordinates.
+        """
+        n = sum(self.sizes.values())
+        change, begin = np.eye(n), 0
+        for key, size in self.sizes.items():
+            if key in gradients:
+                rows = [gradients[key](np.eye(size)[k]).ravel() for k in range(size)]
+                change[begin : begin + size, begin : begin + size] = np.transpose(rows)
+            begin += size
+        return replace(
+            self,
+            matrix=change @ self.matrix @ change.T,
+            robust=change @ self.robust @ change.T,
+            bias=change @ self.bias @ change.T,
+            noise=change @ self.noise @ change.T,
+            spread=change**4 @ self.spread,
+        )
+
+
+def model_of(a: Half, b: Half, weight: Image, sizes: dict[str, int]) -> tuple[float, Matrix, GaussNewton]:
+    """Compute loss, gradient and model from two halves of the samples.
+
+    Args:
+        a: one half.
+        b: the other half, with independent samples.
+        weight: W, height x width x channels.
+        sizes: number of entries of each variable, in the order of the Jacobians.
+
+    Returns:
+        The loss of the mean of both images, the gradient, and the model.
+    """
+    n = len(a.jacobian)
+    matrix, robust, bias, noise = np.zeros((4, n, n))
+    gradient, spread = np.zeros((2, n))
+    rows = TILE * max(1, _AT_ONCE // max(1, n * TILE * weight[0].size))
+    loss = excess = 0.0
+    for begin in range(0, len(weight), rows):
+        some = slice(begin, begin + rows)
+        w = weight[some].astype(np.float64)
+        r, s = (half.residual[some].astype(np.float64) for half in (a, b))
+        J, K = (half.jacobian[:, some].astype(np.float64) for half in (a, b))
+        loss += 0.125 * float((w * (r + s) ** 2).sum())
+        excess += 0.125 * float((w * (r - s) ** 2).sum())
+        gradient += 0.5 * (w * (J * s + K * r)).sum(axis=(1, 2, 3))
+        matrix += (w * J).reshape(n, -1) @ K.reshape(n, -1).T
+        differences = 0.5 * (J - K)
+        bias += (w * differences).reshape(n, -1) @ differences.reshape(n, -1).T
+        shared = np.where(J * K > 0, np.where(np.abs(J) < np.abs(K), J, K), 0)
+        robust += (w * shared).reshape(n, -1) @ shared.reshape(n, -1).T
+        errors = _tiles(0.5 * (w * (J * r - K * s)).sum(axis=3))
+        noise += errors @ errors.T
+        spread += (_tiles((w * differences**2).sum(axis=3)) ** 2).sum(axis=1)
+    return loss, gradient, GaussNewton(sizes, 0.5 * (matrix + matrix.T), robust, bias, noise, spread, excess)
+
+
+def _tiles(images: Matrix) -> Matrix:
+    """Sum n images over square tiles; returns n x tiles."""
+    for axis in (1, 2):
+        images = np.add.reduceat(images, range(0, images.shape[axis], TILE), axis=axis)
+    return images.reshape(len(images), -1)
+
+
+def curvature(penalty: Callable[[Array], tuple[float, Array]], value: Array) -> Matrix:
+    """Differentiate the gradient of a regularizer numerically, once per entry; negative curvature counts as zero.
+
+    Args:
+        penalty: value and gradient of the regularizer as a function of the variable.
+        value: the variable.
+    """
+    columns = []
+    for k, entry in enumerate(value.ravel().tolist()):
+        slopes, ends = [], []
+        for side in (1, -1):
+            moved = value.copy()
+            moved.flat[k] += np.float32(side * DIFFERENCE * max(abs(entry), DIFFERENCE))
+            ends.append(float(moved.flat[k]))
+            slopes.append(penalty(moved)[1].astype(np.float64).ravel())
+        columns.append((slopes[0] - slopes[1]) / (ends[0] - ends[1]))
+    matrix = np.array(columns)
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return (vectors * np.maximum(values, 0)) @ vectors.T
