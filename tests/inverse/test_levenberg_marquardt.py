@@ -69,6 +69,19 @@ def go(
     return found
 
 
+def test_a_direction_in_which_the_loss_is_constant_neither_ends_the_search_nor_the_process() -> None:
+    """As the common scale of exposures and albedo; its noise affects no image."""
+    matrix = np.array([[1.0, 1, 0], [1, 1, 0], [0, 0, 4]])
+    search, noise = optimiser(), 1e-4 * np.eye(3)
+    model = GaussNewton(SIZES, matrix, matrix, 0 * noise, noise, np.zeros(3), 0.0)
+    assert search._excess(model) == pytest.approx(0.5 * (1e-4 / 2 + 1e-4 / 4), rel=1e-3)
+    search.observe(model)
+    stepped = search.step(START, {"a": np.float32([1]), "b": np.float32([[1], [0.4]])}, {}, 1.0)
+    step = flat(stepped) - flat(START)
+    assert step[0] + step[1] == pytest.approx(-1, rel=0.05) and step[2] == pytest.approx(-0.1, rel=0.05)
+    assert not search.draw
+
+
 def test_the_optimum_without_noise_is_found_in_few_steps() -> None:
     found = go(optimiser(), START, 15)
     assert found[0]["b"].shape == (2, 1) and found[0]["b"].dtype == np.float32

@@ -356,9 +356,8 @@ def test_every_flipped_bit_of_what_a_resume_reads_is_noticed(
     run = Path("run")
     problem = build_problem(load_config(run / "config.json"), Path.cwd())
     state = new_run(problem, problem.integrator, record=False)
-    levels = {variable.key: variable.levels for variable in problem.variables}
     checks: dict[str, Callable[[Path], Any]] = {
-        CHECKPOINT: lambda path: checkpoint.restore(path, state, levels),
+        CHECKPOINT: lambda path: checkpoint.restore(path, state, problem.variables),
         "images/target-right.exr": Sums(run).require,
     }
     for name, check in checks.items():

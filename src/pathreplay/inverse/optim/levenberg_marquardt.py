@@ -44,6 +44,8 @@ GOOD, POOR = 0.75, 0.25
 """Ratios of the actual to the predicted decrease of the loss, above which λ falls, and below which it grows."""
 FALL, RISE = 0.1, 2.0
 LEAST, MOST_DAMPING = 1e-9, 1e9
+FLAT = 1e-8
+"""Ratio of eigenvalues of H, relative to its diagonal, below which the loss counts as constant along an eigenvector."""
 LARGEST = 4.0
 """Largest ratio of H to the robust matrix: noise lowers the latter less than that."""
 SIGNAL = 1e-3
@@ -234,10 +236,15 @@ class LevenbergMarquardt:
         return step, float(-point.gradient @ step - 0.5 * step @ model @ step)
 
     def _excess(self, model: GaussNewton) -> float:
-        """Return ν, by which the noise of one evaluation raises the loss at the minimum on average."""
-        free = _scale(model) > 0
-        some = np.ix_(free, free)
-        return 0.5 * float(np.trace(np.linalg.solve(_positive(model)[some], model.noise[some])))
+        """Return ν, by which the noise of one evaluation raises the loss at the minimum on average.
+
+        Directions in which the loss hardly changes do not count, such as the common scale of exposures.
+        """
+        scale = _scale(model)
+        free = scale > 0
+        unit = np.sqrt(np.outer(scale[free], scale[free]))
+        H, noise = (matrix[np.ix_(free, free)] / unit for matrix in (_positive(model), model.noise))
+        return 0.5 * float(np.trace(scipy.linalg.pinvh(H, rtol=FLAT) @ noise)) if free.any() else 0.0
 
     def _split(self, x: Matrix) -> dict[str, Array]:
         parts = np.split(x, np.cumsum(list(self._sizes.values()))[:-1])
