@@ -1,7 +1,7 @@
 """The Gauss-Newton model of a loss that sums weighted squares: its matrix, and the noise of matrix and gradient.
 
 With residuals r = I - T, weights W and the Jacobian J = ∂I/∂v, the loss is ½ rᵀWr, its gradient g = JᵀWr and the
-Gauss-Newton matrix H = JᵀWJ. Two halves a and b of the samples estimate all three without robust:
+Gauss-Newton matrix H = JᵀWJ. Two halves a and b of the samples estimate all three without bias:
 
     ½ r_aᵀ W r_b,      g = ½ (J_aᵀ W r_b + J_bᵀ W r_a),      H = ½ (J_aᵀ W J_b + J_bᵀ W J_a).
 
@@ -46,7 +46,7 @@ class GaussNewton:
     sizes: dict[str, int]
     """Number of entries of each variable, in their order."""
     matrix: Matrix
-    """H, symmetric; unrobusted, and therefore not always positive."""
+    """H, symmetric; unbiased, and therefore not always positive semidefinite."""
     robust: Matrix
     """Like H, from what both halves agree on: the smaller derivative of a pixel, or zero if the signs differ. Positive
     semidefinite; outliers of one half have no effect, but the noise of both adds to it."""
