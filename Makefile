@@ -66,4 +66,4 @@ bench: $(READY)
 	$(BIN)/python -m benchmarks $(TASKS)
 
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache build src/*.egg-info
+	rm -rf $(VENV) .coverage .pytest_cache .ruff_cache .mypy_cache build src/*.egg-info

@@ -181,7 +181,7 @@ class Entry:
     """Task, learning rate, samples per pixel and seed -> a loop at its initial values."""
     applies: Callable[[Kind], bool] = lambda kind: True
     warm_up: int = 1
-    """Iterations per training view before the clock starts: kernels are compiled, and those of pathreplay recorded."""
+    """Iterations per training view before the clock starts. They compile kernels, and pathreplay records its own."""
 
 
 def plain(integrator: str) -> Entry:

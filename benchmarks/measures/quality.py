@@ -49,7 +49,7 @@ class Quality(Measure):
         """Nothing: what the search has found is kept."""
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """All curves, those of the search first."""
+        """All curves; the curves of the search come first."""
         return {name: {"curves": [asdict(curve) for curve in self.curves[name]]} for name in kept}
 
     def _run(self, method: str, rate: float, spp: int, seed: int, goal: float, budget: float) -> Curve:

@@ -57,7 +57,7 @@ def picture(run: Path, name: str) -> tuple[str, bytes] | None:
 
 
 def report(run: Path) -> bytes | None:
-    """Return the report; None if there is none, or if the live page is newer because the run was resumed."""
+    """Return the report; None if it does not exist, or if the live page is newer because the run was resumed."""
     with contextlib.suppress(OSError):
         written = (run / REPORT).stat().st_mtime_ns
         with contextlib.suppress(FileNotFoundError):
