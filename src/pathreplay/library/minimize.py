@@ -88,10 +88,10 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"``, ``"l-bfgs-b"``,
             ``"levenberg-marquardt"``, or a mapping with ``type`` and options. An optimizer of `mitsuba.ad` must have no
             variables yet. Its learning rate applies to parameters without a learning rate of their own. Any other
-            object needs a method
-            ``step(values, gradients, learning_rates, loss) -> values``, with arrays by name. A function needs the
-            interface of `scipy.optimize.minimize`, such as ``functools.partial(scipy.optimize.minimize,
-            method="SLSQP")``. It supports parameters with up to 1000 entries in total.
+            object needs a method ``step(values, gradients, learning_rates, loss) -> values``, with arrays by name. A
+            function needs the interface of `scipy.optimize.minimize`, such as
+            ``functools.partial(scipy.optimize.minimize, method="SLSQP")``. It supports parameters with up to 1000
+            entries in total.
         steps: number of iterations. Default: ``iterations`` of the problem's job, or 200.
         callbacks: functions that are called with an `Iteration` after each step; one that returns True stops the loop.
         progress: show a bar on a terminal, the loss curve and images in a notebook, or lines elsewhere.
