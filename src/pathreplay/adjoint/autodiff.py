@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -59,6 +59,15 @@ def _attached_arrival(at: Arrival) -> Arrival:
     return replace(at, ray=ray, pdf=pdf)
 
 
+def _with_tangent(at: Arrival, tangent: RayDerivative) -> Arrival:
+    """Copy an arrival; ray and density have the given tangent."""
+    at = _attached_arrival(at)
+    dr.set_grad(at.ray.o, tangent.o)
+    dr.set_grad(at.ray.d, tangent.d)
+    dr.set_grad(at.pdf, tangent.pdf)
+    return at
+
+
 def backward_step(
     trace: TraceConfig,
     v: VertexRecord,
@@ -97,15 +106,54 @@ def forward_step(
 ) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative]:
     """Evaluate step i again; return it with the tangents of its emission e_i, its weight w_i and the next arrival."""
     with dr.resume_grad():
-        at = v.at
-        if attached:
-            at = _attached_arrival(at)
-            dr.set_grad(at.ray.o, tangent.o)
-            dr.set_grad(at.ray.d, tangent.d)
-            dr.set_grad(at.pdf, tangent.pdf)
+        at = _with_tangent(v.at, tangent) if attached else v.at
         step = repeat_step(trace, replace(v, at=at), attached, active)
         δe, δw, δo, δd, δpdf = tangents(step.e, step.w, step.ray_next.o, step.ray_next.d, step.pdf)
     return step, δe, δw, RayDerivative(δo, δd, δpdf)
+
+
+class Footprint(Protocol):
+    """Weights of the pixels around a film position, along both axes."""
+
+    x: list[mi.Float]
+    y: list[mi.Float]
+
+
+F = TypeVar("F", bound=Footprint)
+
+
+@dataclass
+class SplatTangent(Generic[F]):
+    """The contribution of a vertex to the film, and its tangent."""
+
+    c: mi.Spectrum
+    at: F
+    δc: mi.Spectrum
+    δx: list[mi.Float]  # tangents of ``at.x``
+    δy: list[mi.Float]
+
+
+def forward_splat(
+    trace: TraceConfig,
+    v: VertexRecord,
+    attached: bool,
+    tangent: RayDerivative,
+    footprint: Callable[[mi.Point2f], F],
+    active: mi.Bool,
+) -> tuple[Step, SplatTangent[F], mi.Spectrum, RayDerivative]:
+    """Evaluate a step of a light path again; return it with the tangents of its splat, its weight and its next arrival."""
+    with dr.resume_grad():
+        at = _with_tangent(v.at, tangent) if attached else v.at
+        step = repeat_step(trace, replace(v, at=at), attached, active)
+        assert step.splat is not None
+        on_film = footprint(step.splat.s)
+        n = len(on_film.x)
+        ray = step.ray_next
+        δc, δw, δo, δd, δpdf, *δh = tangents(
+            step.splat.c, step.w, ray.o, ray.d, step.pdf, *on_film.x, *on_film.y
+        )
+    splat = SplatTangent(dr.detach(step.splat.c), dr.detach(on_film), δc, δh[:n], δh[n:])
+    return step, splat, δw, RayDerivative(δo, δd, δpdf)
 
 
 def backward_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> RayDerivative:

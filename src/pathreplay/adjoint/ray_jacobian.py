@@ -128,7 +128,7 @@ def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active:
             ray = mi.Ray3f(at.ray)
             si = at.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
             ray.o = ray.o + ray.d * slide
-            slid = Arrival(ray=ray, hit=at.hit, pdf=pdf, delta=at.delta, camera=at.camera)
+            slid = replace(at, ray=ray, pdf=pdf)
             e = dr.sum(weight * emission(trace.scene, slid, si, True, active))
             slopes.append(dr.select(active, tangents(e)[0], 0))
     return Slope(*slopes)
@@ -175,7 +175,7 @@ def linearise(
         with dr.resume_grad(x[k]):
             ray = mi.Ray3f(v.at.ray)
             ray.o, ray.d = frame.point(ray.o, x), frame.direction(ray.d, x)
-            at = Arrival(ray=ray, hit=v.at.hit, pdf=v.at.pdf, delta=v.at.delta, camera=v.at.camera)
+            at = replace(v.at, ray=ray)
             e, w, x_next = local_terms(trace, v, at, δL * v.β, slope, frame_next, active)
             columns.append(tangents(e, w, *x_next))
     A = [columns[k][2 + j] for j in range(4) for k in range(4)]

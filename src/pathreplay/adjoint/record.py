@@ -82,6 +82,7 @@ class Layout:
     emissive: bool
     passes: bool
     branch: bool
+    splits: bool  # caustics are omitted
     always: bool = True  # condition of the fields in every record
 
     @property
@@ -93,10 +94,13 @@ class Layout:
     def of(trace: TraceConfig, moves: bool) -> Layout:
         """Return the layout of the records of a trace."""
         media = trace.media is not None
-        fixed = not media and not moves and not trace.traits.lights_vary
+        fixed = not media and not moves and not trace.traits.lights_vary and trace.to_sensor is None
         kinds = {name: media and getattr(trace.media, name) for name in ("chromatic", "emissive", "passes")}
         glows, resamples = fixed and trace.traits.area_lights, trace.resamples or media
-        return Layout(mi.variant(), moves, resamples, fixed, glows, media=media, branch=trace.branch, **kinds)
+        splits = trace.without_caustics
+        return Layout(
+            mi.variant(), moves, resamples, fixed, glows, media=media, branch=trace.branch, splits=splits, **kinds
+        )
 
 
 # Field of `VertexRecord`, its type in Mitsuba, and the property of `Layout` under which it is recorded.
@@ -143,6 +147,7 @@ BITS = (
     ("at.hit.valid", "always"),
     ("at.delta", "varies"),
     ("at.camera", "always"),
+    ("at.scattered", "splits"),
     ("kept.lit", "always"),
     ("kept.black", "always"),
     ("kept.delta", "fixed"),
@@ -231,6 +236,8 @@ def _blank(layout: Layout, ray0: mi.Ray3f) -> VertexRecord:
     zero, no = mi.Float(0), mi.Bool(False)
     ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0), ray0.time, ray0.wavelengths)
     at = Arrival(ray, dr.zeros(mi.PreliminaryIntersection3f), zero, no, no)
+    if layout.splits:
+        at.scattered = no
     kept = SampledContinuation(mi.Vector3f(0), zero, no, no, mi.UInt32(0), no)
     if layout.fixed:
         kept.known = KnownLight(mi.Spectrum(0), mi.Vector3f(0), mi.Spectrum(0))

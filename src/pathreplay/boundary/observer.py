@@ -224,6 +224,8 @@ class ObserverVertex:
     def arrival(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, pdf: mi.Float) -> Arrival:
         """Return the arrival at ``hit`` of a path that continues from the observer along ``ray``."""
         at = Arrival(ray, hit, pdf, mi.Bool(False), mi.Bool(False))
+        if self.trace.without_caustics:
+            at.scattered = self.at.camera | self.at.scattered
         if self.trace.media is None:
             return at
         unsampled = self.event & ~self.at.medium.use_emitter_sampling()

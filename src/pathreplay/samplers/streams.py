@@ -27,6 +27,8 @@ class Stream(IntEnum):
     SECONDARY_KEYS = 0x2545F491
     VOLUMETRIC_KEYS = 0x3C6EF372
     VOLUMETRIC_CENTRES = 0x1F83D9AB
+    # Hashed with the seed of a pass.
+    PARTICLES = 0x68E31DA4
     # Combined with the key of a path, by exclusive or.
     EMITTER_SEGMENTS = 0x1B873593
     ARCS = 0x38B34AE5

@@ -89,7 +89,7 @@ def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.B
 
 def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
     """Return the MIS-weighted environment radiance along rays that ``left`` the scene, differentiably."""
-    if trace.scene.environment() is None:
+    if trace.scene.environment() is None or trace.to_sensor is not None:
         return mi.Spectrum(0)
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.t, si.wi, si.time, si.wavelengths = dr.inf, -at.ray.d, at.ray.time, at.ray.wavelengths
@@ -97,7 +97,12 @@ def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
 
 
 def sees_lights(trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Return the lanes whose ray sees emitters. With ``hide_emitters``, camera rays that leave the scene see none."""
+    """Return the lanes whose ray sees emitters. With ``hide_emitters``, camera rays that leave the scene see none.
+
+    Without caustics, a delta lobe sees no emitter other than the environment if the path has scattered before.
+    """
+    if trace.without_caustics:
+        active = active & ~(at.delta & at.scattered & si.is_valid())
     return active & (~at.camera | si.is_valid()) if trace.hide_emitters else active
 
 

@@ -31,8 +31,11 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
 def vertex_glow(
     trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool
 ) -> mi.Spectrum:
-    """Return the `emission` at a vertex, or zero if there is no area light and the caller adds the background."""
-    if trace.background_apart and not trace.traits.area_lights:
+    """Return the `emission` at a vertex, or zero if there is no area light and the caller adds the background.
+
+    Light paths see no emission.
+    """
+    if trace.to_sensor is not None or (trace.background_apart and not trace.traits.area_lights):
         return mi.Spectrum(0)
     return emission(trace.scene, at, si, attached, active)
 

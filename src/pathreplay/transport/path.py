@@ -116,7 +116,10 @@ def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.
     if trace.skips_null:
         hit = skip_null(trace, ray, hit, active)
     if trace.media is None:
-        return Arrival(ray=ray, hit=hit, pdf=kept.pdf, delta=kept.delta, camera=mi.Bool(False))
+        onward = Arrival(ray=ray, hit=hit, pdf=kept.pdf, delta=kept.delta, camera=mi.Bool(False))
+        if trace.without_caustics:
+            onward.scattered = dr.select(at.camera, ~kept.delta, at.scattered)
+        return onward
     camera = null & at.camera
     if trace.hide_emitters:
         hit = behind_emitters(trace, ray, hit, active & camera)

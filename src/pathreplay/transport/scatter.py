@@ -68,6 +68,9 @@ def choose(
     if v.inside is not None and trace.media.passes:
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
     f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(ctx, v.si, v.si.to_local(d), u.lobe, u.direction, at_surface)
+    if ctx.mode == mi.TransportMode.Importance:
+        f *= shading_correction(v.si, v.si.to_local(d))
+        w *= shading_correction(v.si, sample.wo)
     delta, null = (mi.has_flag(sample.sampled_type, kind) for kind in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
     kept = SampledContinuation(
         v.si.to_world(sample.wo), sample.pdf, delta, dr.all(w == 0), sample.sampled_component, lit
@@ -101,6 +104,8 @@ def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> 
     """Evaluate scattering of light from the world direction ``d`` (Spectrum), and the density of sampling ``d``."""
     surface = active if v.inside is None else active & v.surface
     f, pdf = v.bsdf.eval_pdf(ctx, v.si, v.si.to_local(d), surface)
+    if ctx.mode == mi.TransportMode.Importance:
+        f *= shading_correction(v.si, v.si.to_local(d))
     if v.inside is None:
         return f, pdf
     event = v.inside.event
@@ -159,7 +164,23 @@ def _at_surface(
     if trace.traits.lobes > 0:
         delta = active & kept.delta
         w = dr.select(delta, _delta_weight(trace, v, u, ctx, kept, w_sample, delta), w)
+    if ctx.mode == mi.TransportMode.Importance:
+        w *= shading_correction(si, si.to_local(d))
     return w, d, pdf
+
+
+def shading_correction(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Float:
+    """Return the factor of a BSDF on light paths where the shading normal n_s differs from the geometric normal n_g.
+
+    Light arrives from ω_i and leaves along ω_o, in local coordinates ``si.wi`` and ``wo``. The factor makes light paths
+    the adjoint of camera paths [Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, p. 155]:
+
+        |(ω_i·n_s) (ω_o·n_g)| / |(ω_o·n_s) (ω_i·n_g)|
+    """
+    n = si.to_local(si.n)
+    above = mi.Frame3f.cos_theta(si.wi) * dr.dot(wo, n)
+    below = mi.Frame3f.cos_theta(wo) * dr.dot(si.wi, n)
+    return dr.select(below != 0, dr.abs(above) * dr.rcp(dr.abs(dr.select(below != 0, below, 1))), 0)
 
 
 def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:

@@ -30,6 +30,8 @@ class CameraStart:
         if trace.hide_emitters:
             hit = behind_emitters(trace, ray, hit, active)
         at = Arrival(ray=ray, hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
+        if trace.without_caustics:
+            at.scattered = mi.Bool(False)
         if trace.media is not None:
             at.medium = medium_around(trace)
             at.behind = mi.Float(0)

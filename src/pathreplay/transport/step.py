@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.samplers.sampler import Sampler
-from pathreplay.transport import arrive, connect, scatter
+from pathreplay.transport import arrive, connect, particle, scatter
 from pathreplay.transport.vertex import (
     Arrival,
     Flight,
@@ -53,8 +53,10 @@ def choose_step(
     flight. Null boundaries are returned as ``null`` steps, which do not count as vertices. ``ctx`` contains the
     transport mode (default: radiance) and may restrict sampling on surfaces to one BSDF component.
     """
-    ctx = mi.BSDFContext() if ctx is None else ctx
     at, go_on, active = visit.at, visit.go_on, visit.active
+    if trace.to_sensor is not None:
+        return particle.choose_step(trace, at, u, sampler, go_on, active)
+    ctx = mi.BSDFContext() if ctx is None else ctx
     v = arrive.choose(trace, at, sampler, visit.β, active, flight)
     link = connect.choose(trace, v, at.medium, u, sampler, go_on)
     to = scatter.choose(trace, v, at, u, ctx, link.light.d, link.lit, go_on)
@@ -87,6 +89,8 @@ def repeat_step(
     directions are constant. Visibility and Russian roulette are never differentiated. ``ctx`` is the context that
     `choose_step` used.
     """
+    if trace.to_sensor is not None:
+        return particle.repeat_step(trace, again, attached, active)
     ctx = mi.BSDFContext() if ctx is None else ctx
     v = arrive.repeat(trace, again, attached, active)
     e = v.glow + connect.repeat(trace, v, again, ctx, attached)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import drjit as dr
@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.facts.traits import Traits
+from pathreplay.transport.sensor import SensorLink
 from pathreplay.transport.volume.media import Media
 
 Real = TypeVar("Real", "mi.Float", "mi.Spectrum")
@@ -50,6 +51,14 @@ class TraceConfig:
     may_slide: bool = False
     """Whether boundary terms are estimated. Some smooth continuations then have a fixed direction, although edges may
     move across this direction (see `keeps_direction` and `is_seen_through` in `scatter`)."""
+
+    # Light paths.
+    to_sensor: SensorLink | None = None
+    """The sensor to which vertices are connected, on paths that start at emitters. None: paths start at the sensor, and
+    vertices are connected to emitters."""
+    without_caustics: bool = False
+    """Whether paths from the sensor omit caustics, which light paths add: paths whose first vertex scatters with a
+    smooth lobe, and whose last vertex before the emitter with a delta lobe."""
 
     # Choices of the caller.
     skips_null: bool = False
@@ -109,6 +118,8 @@ class Arrival:
     # None in scenes without media:
     medium: mi.MediumPtr = None  # type: ignore[assignment]  # the medium around the ray
     behind: mi.Float = None  # type: ignore[assignment]  # distance from the ray's origin back to the previous vertex, through null boundaries
+    # None unless caustics are omitted:
+    scattered: mi.Bool = None  # type: ignore[assignment]  # the first vertex of the path has scattered with a smooth lobe
 
 
 @dataclass
@@ -236,14 +247,23 @@ class Signature:
 
 
 @dataclass
+class Splat:
+    """The contribution of a vertex of a light path to the film, before the throughput."""
+
+    c: mi.Spectrum  # f W, with W the importance of the sensor
+    s: mi.Point2f  # film position in pixels
+
+
+@dataclass
 class Step:
     """One vertex of a path, L_i = e_i + w_i L_{i+1}, together with the continuation r_{i+1}."""
 
-    e: mi.Spectrum  # emission (MIS weighted) + next-event estimate
+    e: mi.Spectrum  # emission (MIS weighted) + next-event estimate; on light paths, contribution times image adjoint
     w: mi.Spectrum  # f/p or lobe weight, before Russian roulette
     ray_next: mi.Ray3f
     pdf: mi.Float  # density of the continuation, for the next vertex
     signature: Signature
+    splat: Splat | None = field(default=None, kw_only=True)  # on light paths
 
 
 @dataclass

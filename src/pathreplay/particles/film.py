@@ -1,0 +1,152 @@
+"""The film of light paths: contributions at arbitrary positions, spread by the reconstruction filter.
+
+The pixel at x has the value Σ h(x - s) c / ∫h, with h the filter, s the film position of a contribution, and c its
+value. The sum is differentiable in c and s. Mitsuba's `ImageBlock` divides by the sum of h over the pixels around s
+instead, and omits the derivative of this sum.
+
+Contributions from up to one filter radius outside of the film are added as well. A contribution that moves across the
+border of the film then changes the image continuously. The image is the same as with ``sample_border = true`` for
+camera paths.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.transport.sensor import METER
+
+STEPS = 4096  # of the midpoint rule for the integral of the filter
+
+
+@dataclass
+class Footprint:
+    """The pixels that a contribution reaches: n x n pixels from a corner on, and the filter along both axes."""
+
+    corner: mi.Point2i
+    x: list[mi.Float]
+    y: list[mi.Float]
+
+
+@dataclass(frozen=True)
+class ParticleFilm:
+    """The film of a sensor. Buffers have four numbers per pixel: red, green, blue, and zero."""
+
+    film: mi.Film
+    width: int
+    height: int
+    n: int  # pixels along one side of a footprint
+    meter: bool  # all contributions belong to one pixel
+    mass: float  # integral of the filter over the film plane
+
+    @staticmethod
+    def of(sensor: mi.Sensor) -> ParticleFilm:
+        """Describe the film of a sensor. Raises PathreplayError if it stores other things than colours."""
+        film = sensor.film()
+        film.prepare([])
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+            raise PathreplayError(
+                f"light paths cannot be added to the film of sensor '{sensor.id()}' of class {film.class_name()}, which "
+                "stores spectra: take an hdrfilm"
+            )
+        filter, (width, height) = film.rfilter(), film.crop_size()
+        radius = float(filter.radius())
+        at = ((np.arange(STEPS) + 0.5) / STEPS * 2 - 1) * radius
+        length = 2 * radius * float(np.mean(filter.eval(mi.Float(at.astype(np.float32))).numpy(), dtype=float))
+        meter = sensor.class_name() == METER
+        return ParticleFilm(film, int(width), int(height), math.ceil(2 * radius), meter, length * length)
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return self.width * self.height
+
+    def footprint(self, s: mi.Point2f) -> Footprint:
+        """Return the footprint of a film position, differentiably in the position."""
+        filter, radius = self.film.rfilter(), float(self.film.rfilter().radius())
+        corner = mi.Point2i(dr.ceil(dr.detach(s) - (radius + 0.5)))
+        first = mi.Point2f(corner) + 0.5 - s
+        return Footprint(
+            corner,
+            [filter.eval(first.x + k) for k in range(self.n)],
+            [filter.eval(first.y + k) for k in range(self.n)],
+        )
+
+    def add(self, sums: mi.Float, at: Footprint, x: list[mi.Float], y: list[mi.Float], c: mi.Color3f, ok: mi.Bool) -> None:
+        """Add the colour ``c`` to the pixels of a footprint, weighted by ``x`` and ``y`` along the axes."""
+        for column in range(self.n):
+            for row in range(self.n):
+                index, inside = self._pixel(at, column, row)
+                value = c if self.meter else c * (x[column] * y[row])
+                dr.scatter_add(sums, mi.Vector4f(value.x, value.y, value.z, 0), index, ok & inside)
+
+    def gather(self, buffer: mi.Float, s: mi.Point2f, active: mi.Bool) -> mi.Color3f:
+        """Return Σ h(x - s) of the buffer at x, differentiably in s."""
+        at, total = self.footprint(s), mi.Color3f(0)
+        for column in range(self.n):
+            for row in range(self.n):
+                index, inside = self._pixel(at, column, row)
+                A = dr.gather(mi.Vector4f, buffer, index, active & inside)
+                total += mi.Color3f(A.x, A.y, A.z) * (1 if self.meter else at.x[column] * at.y[row])
+        return total
+
+    def _pixel(self, at: Footprint, column: int, row: int) -> tuple[mi.UInt32, mi.Bool]:
+        if self.meter:
+            return mi.UInt32(0), mi.Bool(column == 0 and row == 0)
+        x, y = at.corner.x + column, at.corner.y + row
+        return mi.UInt32(y * self.width + x), (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+    def scale(self, number: int) -> float:
+        """Return the factor of the sum over ``number`` light paths that makes it an image."""
+        return self.pixels / (number * (1.0 if self.meter else self.mass))
+
+    def develop(self, sums: mi.Float) -> mi.TensorXf:
+        """Convert a buffer to an image of the film, with zero alpha, differentiably."""
+        channels = self.film.create_block().channel_count()
+        i = dr.arange(mi.UInt32, self.pixels * channels)
+        pixel, channel = i // channels, i % channels
+        colour = channel < 3
+        value = dr.gather(mi.Float, sums, 4 * pixel + channel, colour)
+        block = dr.select(colour, value, dr.select(channel == channels - 1, mi.Float(1), 0))
+        tensor = mi.TensorXf(block, (self.height, self.width, channels))
+        self.film.prepare([])
+        self.film.put_block(mi.ImageBlock(tensor, self.film.crop_offset()))
+        return self.film.develop()
+
+    def adjoint(self, grad_in: mi.TensorXf) -> mi.Float:
+        """Back-propagate the adjoint of an image to a buffer."""
+        with dr.resume_grad():
+            sums = dr.zeros(mi.Float, 4 * self.pixels)
+            dr.enable_grad(sums)
+            image = self.develop(sums)
+            dr.set_grad(image, grad_in)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+            buffer = dr.grad(sums)
+        self.film.clear()
+        dr.eval(buffer)
+        return buffer
+
+
+def colour(c: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.Color3f:
+    """Convert a radiance to the colour that films store, as Mitsuba does. Linear in the radiance."""
+    if mi.is_spectral:
+        return mi.spectrum_to_srgb(c, wavelengths)
+    return mi.Color3f(c.x) if mi.is_monochromatic else mi.Color3f(c)
+
+
+def colour_adjoint(A: mi.Color3f, wavelengths: mi.Spectrum) -> mi.Spectrum:
+    """Apply the transpose of `colour`."""
+    if mi.is_spectral:
+        result = mi.Spectrum(0)
+        for k in range(len(result)):
+            unit = mi.Spectrum(0)
+            unit[k] = 1
+            result[k] = dr.dot(A, mi.spectrum_to_srgb(unit, wavelengths))
+        return result
+    return mi.Spectrum(A.x + A.y + A.z) if mi.is_monochromatic else mi.Spectrum(A)

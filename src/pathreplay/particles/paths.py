@@ -1,0 +1,202 @@
+"""Loops over light paths: the image, its tangent, and the sweep that back-propagates its adjoint.
+
+Each lane traces many light paths one after the other. Memory therefore does not depend on the number of light paths.
+The radiance throughput of a path is W_0 β, with W_0 the weight of its first ray. With A the adjoint of the image at the
+film, the derivative of a loss is that of Σ W_0 L_0, with L_i = A(s_i) c_i + w_i L_{i+1}.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import (
+    NonFiniteCounter,
+    RayDerivative,
+    Unreached,
+    backward,
+    forward_splat,
+    tangents,
+)
+from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
+from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, record_path, sweep_path
+from pathreplay.errors import PathreplayError
+from pathreplay.particles.film import ParticleFilm, colour, colour_adjoint
+from pathreplay.particles.start import Emission, EmitterSamples, EmitterStart
+from pathreplay.platform.device import device_of
+from pathreplay.samplers.owen_sobol import OwenSobolSampler
+from pathreplay.transport.motion import path_moves, weights_vary
+from pathreplay.transport.path import PathState
+from pathreplay.transport.sensor import SensorLink
+from pathreplay.transport.vertex import TraceConfig
+
+# Lanes that trace light paths at the same time.
+LANES = 2**16
+LANES_GPU = 2**20
+
+
+@dataclass(frozen=True)
+class Particles:
+    """``number`` light paths of a scene, a pure function of their key."""
+
+    emission: Emission
+    key: mi.UInt32
+    number: int
+
+    @property
+    def lanes(self) -> int:
+        """Number of lanes."""
+        return min(self.number, LANES_GPU if device_of(mi.variant()).is_gpu else LANES)
+
+    def start(self, trace: TraceConfig, i: mi.UInt32) -> EmitterStart:
+        """Return the start of light paths number ``i``; lanes with larger numbers are inactive."""
+        sampler = OwenSobolSampler.of(i, self.key)
+        return EmitterStart(trace, self.emission, EmitterSamples.draw(sampler), sampler, i < self.number)
+
+    def moves(self, trace: TraceConfig) -> bool:
+        """Return whether light paths or their film positions depend on parameters with gradients."""
+        if trace.attach == "none":
+            return False
+        assert trace.to_sensor is not None
+        start = self.start(trace, dr.arange(mi.UInt32, self.lanes))
+        return trace.to_sensor.moves() or path_moves(trace, start, PathState.begin(trace, start).at)
+
+
+@dr.syntax
+def particle_image(trace: TraceConfig, particles: Particles, film: ParticleFilm) -> mi.TensorXf:
+    """Render the image of light paths. Nothing is differentiated."""
+    sums = dr.zeros(mi.Float, 4 * film.pixels)
+    i = dr.arange(mi.UInt32, particles.lanes)
+    lanes, number = dr.opaque(mi.UInt32, particles.lanes), dr.opaque(mi.UInt32, particles.number)
+
+    while dr.hint(i < number, exclude=[trace, particles, film, sums], label="pathreplay: particles"):
+        start = particles.start(trace, i)
+        _, W = start.emit()
+        path = PathState.begin(trace, start)
+        sampler = start.sampler
+        while dr.hint(path.active, exclude=[trace, film, sums, W], label="pathreplay: light path"):
+            u, step = path.choose(trace, sampler)
+            at, c = film.footprint(step.splat.s), W * path.β * step.splat.c
+            film.add(sums, at, at.x, at.y, colour(c, path.at.ray.wavelengths), path.active & step.kept.lit)
+            path = path.advance(trace, u, step)[0]
+        i += lanes
+
+    return film.develop(sums * film.scale(particles.number))
+
+
+@dr.syntax
+def particle_tangent(
+    trace: TraceConfig, particles: Particles, film: ParticleFilm, lost: NonFiniteCounter
+) -> tuple[mi.TensorXf, bool]:
+    """Compute the tangent of the image from the tangents of the parameters, and return whether paths move.
+
+    ``lost`` counts the paths whose tangent was not finite and was dropped.
+    """
+    sums = dr.zeros(mi.Float, 4 * film.pixels)
+    i = dr.arange(mi.UInt32, particles.lanes)
+    lanes, number = dr.opaque(mi.UInt32, particles.lanes), dr.opaque(mi.UInt32, particles.number)
+    moves = particles.moves(trace)
+
+    while dr.hint(i < number, exclude=[trace, particles, film, sums, lost, moves], label="pathreplay: particles"):
+        start = particles.start(trace, i)
+        with dr.resume_grad():
+            ray0, W0 = start.emit()
+            δo, δd, δβ = tangents(ray0.o, ray0.d, W0)
+        W = dr.detach(W0)
+        δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))
+        path = PathState.begin(trace, start, sustained=True)
+        sampler, broken = start.sampler, mi.Bool(False)
+        while dr.hint(path.active, exclude=[trace, film, sums, W, moves, lost], label="pathreplay: light path"):
+            u, step = path.choose(trace, sampler)
+            onward, v = path.advance(trace, u, step)
+            β, lit = W * path.β, path.active & step.kept.lit
+            again, splat, δw, δ = forward_splat(trace, v, moves, δ, film.footprint, path.active)
+            if dr.hint(moves, mode="scalar"):
+                δ, finite = δ.finite_part()
+                lost.add(path.active & ~finite & ~broken)
+                broken |= ~finite
+            wavelengths = path.at.ray.wavelengths
+            c = colour(β * splat.c, wavelengths)
+            film.add(sums, splat.at, splat.at.x, splat.at.y, colour(δβ * splat.c + β * splat.δc, wavelengths), lit)
+            if dr.hint(moves, mode="scalar"):
+                film.add(sums, splat.at, splat.δx, splat.at.y, c, lit)
+                film.add(sums, splat.at, splat.at.x, splat.δy, c, lit)
+            δβ = (δβ * dr.detach(again.w) + β * δw) * v.rr_weight
+            path = onward
+        i += lanes
+
+    return film.develop(sums * film.scale(particles.number)), moves
+
+
+@dr.syntax
+def particle_sweep(
+    trace: TraceConfig, particles: Particles, film: ParticleFilm, grad_in: mi.TensorXf, lost: NonFiniteCounter
+) -> bool:
+    """Back-propagate the adjoint of the image into the parameters; return whether paths move with the parameters.
+
+    Each path is recorded and swept back as in `sweep`. Not differentiated: visibility and, with ``attach='none'``, all
+    motion.
+
+    Raises PathreplayError if ``max_depth`` exceeds `deepest`, or if the paths depend on no parameter with gradients.
+    """
+    if trace.max_depth > deepest(trace):
+        raise PathreplayError(
+            f"max_depth = {trace.max_depth} is more than the record of a light path can hold ({deepest(trace)}): take "
+            "fewer"
+        )
+    A = film.adjoint(grad_in) * film.scale(particles.number)
+    dr.eval(A)
+
+    def adjoint(s: mi.Point2f, wavelengths: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
+        return colour_adjoint(film.gather(A, s, active), wavelengths)
+
+    assert trace.to_sensor is not None
+    trace = replace(trace, to_sensor=replace(trace.to_sensor, adjoint=adjoint))
+    moves = particles.moves(trace)
+    layout = Layout.of(trace, moves)
+    records = dr.alloc_local(record_type(layout), room_for(trace))
+    i = dr.arange(mi.UInt32, particles.lanes)
+    lanes, number = dr.opaque(mi.UInt32, particles.lanes), dr.opaque(mi.UInt32, particles.number)
+    start0 = particles.start(trace, i)
+    at0 = PathState.begin(trace, start0).at
+    varies = moves or weights_vary(trace, at0)
+    with dr.resume_grad():
+        starts = dr.grad_enabled(*start0.repeat(), start0.emit()[1])
+    if not (varies or starts):
+        raise Unreached("no parameter with gradients reaches the light paths")
+
+    while dr.hint(
+        i < number,
+        exclude=[trace, particles, film, A, adjoint, lost, layout, moves, varies, starts, start0, at0],
+        label="pathreplay: particles",
+    ):
+        start = particles.start(trace, i)
+        _, W = start.emit()
+        path = PathState.begin(trace, start, sustained=True)
+        ray0 = path.at.ray
+        records, count, L, _beyond, _branch = record_path(
+            trace, start.sampler, path, layout, records, mi.UInt32(0), lost
+        )
+        q = RayDerivative.zero()
+        if dr.hint(varies, mode="scalar"):
+            recorded = RecordedPath(layout, records, mi.UInt32(0), count, count - 1, ray0)
+            swept = sweep_path(trace, recorded, PathAdjoint(W, mi.Spectrum(0), q), lost)
+            L, q = swept.L, swept.q
+        if dr.hint(starts, mode="scalar"):
+            with dr.resume_grad():
+                ray, W = start.emit()
+                backward(dr.sum(W * L) + dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
+        i += lanes
+    return moves
+
+
+def link_of(trace: TraceConfig, sensor: mi.Sensor, caustics: bool) -> TraceConfig:
+    """Return the configuration of light paths to a sensor.
+
+    A path of ``max_depth`` segments has one vertex less on a light path than on a camera path: neither the emitter nor
+    the sensor is a vertex. With ``caustics``, only the paths are kept that `TraceConfig.without_caustics` omits.
+    """
+    link = replace(SensorLink.of(sensor), caustics=caustics)
+    return replace(trace, to_sensor=link, max_depth=max(trace.max_depth - 1, 0), without_caustics=False)

@@ -1,0 +1,134 @@
+"""Start: the first ray of a light path, sampled from the emitters of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+from pathreplay.samplers.sampler import Sampler
+from pathreplay.transport.meet import meet
+from pathreplay.transport.surface import surface_point
+from pathreplay.transport.vertex import Arrival, TraceConfig, reciprocal
+
+#: Classes of emitters that can emit rays.
+EMITTERS = frozenset(
+    {
+        "AreaLight",
+        "ConstantBackgroundEmitter",
+        "DirectionalArea",
+        "DirectionalEmitter",
+        "EnvironmentMapEmitter",
+        "PointLight",
+        "Projector",
+        "SpotLight",
+    }
+)
+MAP = "EnvironmentMapEmitter"
+
+
+@dataclass
+class EmitterSamples:
+    """The random numbers of the first ray."""
+
+    time: mi.Float
+    emitter: mi.Float  # choice of the emitter, reused for the wavelengths
+    place: mi.Point2f
+    direction: mi.Point2f
+
+    @staticmethod
+    def draw(sampler: Sampler) -> EmitterSamples:
+        """Draw the random numbers of one ray."""
+        return EmitterSamples(sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+
+
+@dataclass(frozen=True)
+class Emission:
+    """The emitters of a scene, and the probabilities with which light paths start at them."""
+
+    scene: mi.Scene
+    sensor: mi.Sensor  # provides the time
+    picks: mi.DiscreteDistribution
+    maps: tuple[mi.Emitter, ...]  # environment maps
+
+    @staticmethod
+    def of(scene: mi.Scene, sensor: mi.Sensor, caustics: bool) -> Emission | None:
+        """Describe the emitters of a scene; None if no light path starts at them.
+
+        With ``caustics``, light paths start at all emitters except environments. Raises PathreplayError for emitters
+        that cannot emit rays.
+        """
+        emitters = scene.emitters()
+        weights = [0.0 if caustics and each.is_environment() else float(each.sampling_weight()) for each in emitters]
+        if not sum(weights) > 0:
+            return None
+        for each, weight in zip(emitters, weights, strict=True):
+            if weight > 0 and each.class_name() not in EMITTERS:
+                raise PathreplayError(
+                    f"no light path can start at emitter '{each.id()}' of class {each.class_name()}: leave it out, or "
+                    "trace all paths from the sensor"
+                )
+        maps = tuple(each for each in emitters if each.class_name() == MAP)
+        return Emission(scene, sensor, mi.DiscreteDistribution(mi.Float(weights)), maps)
+
+    def emit(self, trace: TraceConfig, u: EmitterSamples, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Sample a ray and its weight: emitted radiance times cosine, over density. Differentiable in the emitters.
+
+        The point on a light has fixed coordinates there, and the direction is fixed in its frame. Both move with the
+        light.
+        """
+        index, again, probability = self.picks.sample_reuse_pmf(u.emitter, active)
+        emitter = dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index, active)
+        time = mi.Float(self.sensor.shutter_open()) + u.time * self.sensor.shutter_open_time()
+        ray, weight = emitter.sample_ray(time, again, u.place, u.direction, active)
+        if self.maps:
+            # Mitsuba 3.9 does not rotate the disk of starting points with the map.
+            box = self.scene.bbox()
+            radius = float(dr.norm(box.extents())) / 2
+            disk = mi.warp.square_to_uniform_disk_concentric(u.place)
+            start = mi.Frame3f(dr.detach(ray.d)).to_world(mi.Vector3f(disk.x, disk.y, 0)) - ray.d
+            on_map = mi.Bool(False)
+            for each in self.maps:
+                on_map |= emitter == mi.EmitterPtr(each)
+            ray.o = dr.select(on_map, mi.Point3f(box.center()) + start * radius, ray.o)
+        if trace.traits.lights_deform:
+            weight *= _growth(trace, emitter, ray, active)
+        return ray, weight * dr.detach(reciprocal(probability))
+
+
+def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+    """Return 1 with the derivative of the log area of the emitting triangle, which Mitsuba omits (see `emitters`)."""
+    back = mi.Ray3f(dr.detach(ray))
+    back.d = -back.d
+    hit = trace.scene.ray_intersect_preliminary(back, active=active)
+    on_mesh = active & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == emitter)
+    area = dr.norm(surface_point(hit, back, on_mesh).A)
+    return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)
+
+
+@dataclass
+class EmitterStart:
+    """The start of light paths. The adjoints of the first ray and of its weight are back-propagated to the emitters."""
+
+    trace: TraceConfig
+    emission: Emission
+    u: EmitterSamples
+    sampler: Sampler  # source of the random numbers of the path
+    active: mi.Bool
+
+    def emit(self) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Return the first ray and its weight, differentiably: see `Emission.emit`."""
+        return self.emission.emit(self.trace, self.u, self.active)
+
+    def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
+        """Find the first arrival, detached."""
+        ray, _ = dr.detach(self.emit())
+        hit = meet(trace, ray, active)
+        return Arrival(ray=mi.Ray3f(ray), hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
+
+    def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Return origin and direction of the rays, differentiably."""
+        ray, _ = self.emit()
+        return ray.o, ray.d
