@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.adjoint.autodiff import Unreached
 from pathreplay.adjoint.baseline import Baseline, BaselineState
 from pathreplay.adjoint.ray_jacobian import Recovery
 from pathreplay.adjoint.record import MAX_DEPTH
@@ -25,6 +26,7 @@ from pathreplay.integrators.film.pixel_passes import obstacle, pixel_loss, scatt
 from pathreplay.integrators.film.surface_flow import SurfaceFlow, can_follow
 from pathreplay.integrators.interior import PathReplay
 from pathreplay.integrators.lifetimes import is_recording
+from pathreplay.integrators.particle_term import ParticleTerm
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.path_integrator import UNBOUNDED, PathIntegrator, reached
 from pathreplay.integrators.properties import choice, deviation, whole_number
@@ -46,6 +48,7 @@ RENAMED = {
 ATTACH = ("delta", "all", "none")
 NULL_BRANCHING: tuple[str | bool, ...] = ("auto", True, False)
 SAMPLING = ("scene", "sobol")
+CAUSTICS = ("camera", "particles")
 BOUNDARIES = ("auto", "none", "primary", "all")
 EDGES = "edges"
 """Entry of `warned` that suppresses further notes about moving edges."""
@@ -87,6 +90,7 @@ class PathReplayIntegrator(PathIntegrator):
     - ``null_branching``: ``auto``, True or False, see below.
     - ``boundary``: ``auto``, ``none``, ``primary`` or ``all``, see below and `Boundary`.
     - ``boundary_spp``: 0, segments per pixel; 0 means as many as the samples of the pass.
+    - ``caustics``: ``camera`` or ``particles``, which traces caustics from the emitters: see `ParticleTerm`.
     - ``sampling``: ``sobol`` replaces an independent sampler by `OwenSobolSampler`; ``scene`` keeps it.
 
     ``boundary = 'auto'`` means ``all`` if something that can occlude light moves (see `edges_move`) and its boundary
@@ -126,6 +130,8 @@ class PathReplayIntegrator(PathIntegrator):
                 f"{self.name}: boundary = '{self.boundary}' with attach = '{self.attach}': boundary terms need "
                 "attach = 'delta': use that, or boundary = 'none'"
             )
+        split = self.name == "pathreplay" and choice(props, self.name, "caustics", "camera", CAUSTICS) == "particles"
+        self.particles: ParticleTerm | None = ParticleTerm(self.max_depth, caustics=True) if split else None
         self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # the scene, and its learned state
 
     @property
@@ -134,6 +140,40 @@ class PathReplayIntegrator(PathIntegrator):
         if self.boundary == "none":
             return (self.interior,)
         return self.interior, Boundary(inner=self.boundary != "primary", spp=self.boundary_spp)
+
+    def _image(self, part: Pass, trace: TraceConfig) -> mi.TensorXf:
+        """Render the image of camera paths and, if there are any, light paths."""
+        image = PathIntegrator._image(self, part, trace)
+        lit = None if self.particles is None else self.particles.image(part, trace)
+        return image if lit is None else image + lit
+
+    def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
+        """Build the trace configuration of camera paths, without caustics if light paths add these."""
+        trace = PathIntegrator._trace_config(self, scene, sensor, state)
+        return trace if self.particles is None else replace(trace, without_caustics=True)
+
+    def _forward(
+        self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None
+    ) -> TermResult:
+        """Compute the tangent of the image as the sum of all terms."""
+        more = () if self.particles is None else (self.particles,)
+        return PathIntegrator._forward(self, (*terms, *more), part, trace, learned)
+
+    def _backward(
+        self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None
+    ) -> TermResult:
+        """Back-propagate through all terms. A parameter may reach only camera paths, or only light paths."""
+        if self.particles is None:
+            return PathIntegrator._backward(self, terms, part, trace, grad_in, learned)
+        unreached, results = [], []
+        for some in ((self.particles,), terms):
+            try:
+                results.append(PathIntegrator._backward(self, some, part, trace, grad_in, learned))
+            except Unreached as error:
+                unreached.append(error)
+        if not results:
+            raise unreached[0]
+        return reduce(add, results)
 
     def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """Add the film flow and its term. The other terms then differentiate motion that the flow does not contain.
@@ -188,6 +228,8 @@ class PathReplayIntegrator(PathIntegrator):
             return f"adjoint = '{self.adjoint}' records no paths; use 'recorded'"
         if facts_of(scene).has_media:
             return "the scene has media; leave them out"
+        if self.particles is not None:
+            return "caustics = 'particles' adds light from other pixels; take 'camera'"
         return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._flow_obstacle(view))
 
     def _flow_obstacle(self, view: Pass) -> str:

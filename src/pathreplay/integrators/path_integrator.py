@@ -148,7 +148,7 @@ class PathIntegrator:
         total = None
         for part in parts(view):
             with self._pass_context():
-                total = _sum(total, image(part, self._trace_config(part.scene, part.sensor, state)), part.share)
+                total = _sum(total, self._image(part, self._trace_config(part.scene, part.sensor, state)), part.share)
         assert total is not None
         return total
 
@@ -161,7 +161,7 @@ class PathIntegrator:
                 learned = self._learned(part, trace, state)
                 if part.flow is not None:
                     part.flow.carry_tangents()
-                result = reduce(add, [term.forward(part, trace, learned) for term in terms])
+                result = self._forward(terms, part, trace, learned)
                 assert result.image is not None
                 tangent = _sum(tangent, result.image, part.share)
             self._log_notes(part, trace, result)
@@ -180,7 +180,7 @@ class PathIntegrator:
                     learned = self._learned(part, trace, state)
                     weighted = grad_in if part.share == 1 else grad_in * part.share
                     with dr.isolate_grad():  # postpones traversal of the film flow, which the terms share, to the end
-                        result = reduce(add, [term.backward(part, trace, weighted, learned) for term in terms])
+                        result = self._backward(terms, part, trace, weighted, learned)
                 self._log_notes(part, trace, result)
                 state = state.after(result)
                 add_up()
@@ -218,6 +218,22 @@ class PathIntegrator:
 
     def keep(self, scene: mi.Scene, state: PassState) -> None:
         """Log warnings about the passes since `begin`, and update the learned state from their results."""
+
+    def _image(self, part: Pass, trace: TraceConfig) -> mi.TensorXf:
+        """Render the image of a part of a pass."""
+        return image(part, trace)
+
+    def _forward(
+        self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None
+    ) -> TermResult:
+        """Compute the tangent of the image as the sum of all terms."""
+        return reduce(add, [term.forward(part, trace, learned) for term in terms])
+
+    def _backward(
+        self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None
+    ) -> TermResult:
+        """Back-propagate the adjoint of the image through all terms."""
+        return reduce(add, [term.backward(part, trace, grad_in, learned) for term in terms])
 
     def _planned(self, view: Pass, state: PassState) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """Return the gradient pass with its film flow, its trace configuration, and the terms to add."""

@@ -42,7 +42,7 @@ def choose_step(
     sampled = scatter.choose(trace, v, at, u, ctx, to.d, lit, active)
     c = sampled.f * to.W
     lit &= dr.any(c != 0)
-    lit &= ~trace.scene.ray_test(v.origin.spawn_ray_to(to.end), lit)
+    lit &= _unoccluded(trace, v, to, lit)
     going = sampled.active & go_on
     if link.caustics:
         going &= ~at.camera | sampled.kept.delta
@@ -76,6 +76,15 @@ def _link(trace: TraceConfig) -> SensorLink:
 
 def _sight(link: SensorLink, v: arrive.Vertex, u: VertexSamples, active: mi.Bool) -> Sighting:
     return link.sight(v.origin, u.light, active)
+
+
+def _unoccluded(trace: TraceConfig, v: arrive.Vertex, to: Sighting, active: mi.Bool) -> mi.Bool:
+    """Test whether the sensor sees a vertex; ``hide_emitters`` makes area emitters transparent, and hides vertices there."""
+    ray = v.origin.spawn_ray_to(to.end)
+    if not (trace.hide_emitters and trace.traits.area_lights):
+        return ~trace.scene.ray_test(ray, active)
+    active = active & (v.si.shape.emitter() == None)  # noqa: E711 (an array of pointers)
+    return active & ~trace.skip_area_emitters(trace.scene, ray, True, active).is_valid()
 
 
 def _weighted(link: SensorLink, splat: Splat, at: Arrival, lit: mi.Bool) -> mi.Spectrum:

@@ -1,0 +1,52 @@
+"""The `pathreplay_particles` integrator plugin: all light by light paths, in place of Mitsuba's `ptracer`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mitsuba as mi
+
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.integrator import PathReplayIntegrator
+from pathreplay.integrators.pass_state import PassState
+from pathreplay.integrators.particle_term import ParticleTerm
+from pathreplay.integrators.path_integrator import PathIntegrator
+from pathreplay.integrators.properties import whole_number
+from pathreplay.transport.vertex import TraceConfig
+
+
+class ParticleIntegrator(PathReplayIntegrator):
+    """Differentiable particle tracer for surfaces.
+
+    Light paths start at the emitters and are connected to the sensor at every vertex. Emitters that the sensor sees
+    directly are rendered with camera rays, one segment long.
+
+    Properties, with the default first:
+
+    - ``max_depth``: 6; -1 is unbounded, which derivatives do not support.
+    - ``rr_depth``: 5.
+    - ``hide_emitters``: False; whether emitters that the sensor sees directly are hidden.
+    - ``samples_per_pass``: accepted as in ``ptracer``, without effect: memory does not depend on the number of paths.
+    - ``attach``, ``boundary`` and ``boundary_spp``: as in `PathReplayIntegrator`. The boundary term contains the edges
+      of directly visible emitters only.
+
+    The number of light paths is the number of pixels times the samples per pixel. Sensors: ``perspective``,
+    ``thinlens``, ``orthographic`` and ``irradiancemeter``. The image is that of a film with ``sample_border = true``
+    (see `ParticleFilm`).
+
+    Not differentiated: the visibility of vertices from each other and from the sensor; with ``attach='none'``, all
+    motion; with a box filter, the motion of film positions.
+    Raises PathreplayError for unknown or unusable properties, for scenes with media, and in polarised variants.
+    """
+
+    name = "pathreplay_particles"
+
+    def __init__(self, props: mi.Properties) -> None:
+        whole_number(props, self.name, "samples_per_pass", -1, lowest=1, unbounded=True, kind="number of samples")
+        PathReplayIntegrator.__init__(self, props)
+        self.particles = ParticleTerm(self.max_depth, caustics=False)
+
+    def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
+        """Return the configuration of the camera rays, which see emitters directly."""
+        trace = PathIntegrator._trace_config(self, scene, sensor, state)
+        return replace(trace, max_depth=min(trace.max_depth, 1))

@@ -1,0 +1,80 @@
+"""The particle term: light paths from the emitters to the sensor, and their derivative at fixed visibility."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter
+from pathreplay.adjoint.baseline import Baseline
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.term import TermResult
+from pathreplay.particles.film import ParticleFilm
+from pathreplay.particles.paths import Particles, link_of, particle_image, particle_sweep, particle_tangent
+from pathreplay.particles.start import Emission
+from pathreplay.samplers.owen_sobol import key_of
+from pathreplay.samplers.streams import Stream
+from pathreplay.transport.vertex import TraceConfig
+
+
+@dataclass(frozen=True)
+class ParticleTerm:
+    """Image and derivative of light paths. Their number is the number of samples of the pass.
+
+    Every path is differentiated as in `PathReplay`, and additionally in its film positions. Not differentiated: the
+    visibility of vertices from each other and from the sensor, and with a box filter the motion of film positions.
+    """
+
+    max_depth: int  # of the path from emitter to sensor, as in Mitsuba
+    caustics: bool  # only the paths that `TraceConfig.without_caustics` omits
+
+    def image(self, view: Pass, trace: TraceConfig) -> mi.TensorXf | None:
+        """Render the image, with zero alpha; None if no light path starts in the scene."""
+        work = self._work(view, trace)
+        return None if work is None else particle_image(*work)
+
+    def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
+        """Compute the tangent of the image: see `Term`."""
+        work, lost = self._work(view, trace), NonFiniteCounter()
+        if work is None:
+            return TermResult()
+        image, moves = particle_tangent(*work, lost)
+        dr.eval(image)
+        return self._result(work[1], lost, moves, image)
+
+    def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
+        """Back-propagate the adjoint of the image: see `Term`."""
+        work, lost = self._work(view, trace), NonFiniteCounter()
+        if work is None:
+            return TermResult()
+        moves = particle_sweep(*work, grad_in, lost)
+        dr.eval()
+        return self._result(work[1], lost, moves)
+
+    def note(self, trace: TraceConfig) -> str:
+        """Return "": see `Term`."""
+        return ""
+
+    def _work(self, view: Pass, trace: TraceConfig) -> tuple[TraceConfig, Particles, ParticleFilm] | None:
+        if trace.media is not None:
+            raise PathreplayError(
+                "light paths do not pass through media yet: remove the media from the scene, or trace all paths from "
+                "the sensor"
+            )
+        emission = Emission.of(view.scene, view.sensor, self.caustics)
+        if emission is None:
+            return None
+        film = ParticleFilm.of(view.sensor)
+        key = key_of(view.opaque_seed, mi.UInt32(int(Stream.PARTICLES)))
+        trace = link_of(replace(trace, max_depth=self.max_depth), view.sensor, self.caustics)
+        return trace, Particles(emission, key, film.pixels * view.spp), film
+
+    def _result(
+        self, particles: Particles, lost: NonFiniteCounter, moves: bool, image: mi.TensorXf | None = None
+    ) -> TermResult:
+        if not moves:
+            return TermResult(image)
+        return TermResult(image, lost=lost.count, paths=particles.number, moves=True)
