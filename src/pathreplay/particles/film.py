@@ -55,11 +55,13 @@ class ParticleFilm:
                 "stores spectra: take an hdrfilm"
             )
         filter, (width, height) = film.rfilter(), film.crop_size()
-        radius = float(filter.radius())
-        at = ((np.arange(STEPS) + 0.5) / STEPS * 2 - 1) * radius
-        length = 2 * radius * float(np.mean(filter.eval(mi.Float(at.astype(np.float32))).numpy(), dtype=float))
+        name = str(filter)
+        if name not in _LENGTHS:
+            _LENGTHS[name] = _length(filter)
         meter = sensor.class_name() == METER
-        return ParticleFilm(film, int(width), int(height), math.ceil(2 * radius), meter, length * length)
+        return ParticleFilm(
+            film, int(width), int(height), math.ceil(2 * float(filter.radius())), meter, _LENGTHS[name] ** 2
+        )
 
     @property
     def pixels(self) -> int:
@@ -131,6 +133,16 @@ class ParticleFilm:
         self.film.clear()
         dr.eval(buffer)
         return buffer
+
+
+# Integrals of filters along a line, by their descriptions. A pass recorded by `dr.freeze` cannot compute them.
+_LENGTHS: dict[str, float] = {}
+
+
+def _length(filter: mi.ReconstructionFilter) -> float:
+    radius = float(filter.radius())
+    at = ((np.arange(STEPS) + 0.5) / STEPS * 2 - 1) * radius
+    return 2 * radius * float(np.mean(filter.eval(mi.Float(at.astype(np.float32))).numpy(), dtype=float))
 
 
 def colour(c: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.Color3f:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -50,7 +51,7 @@ class Emission:
 
     scene: mi.Scene
     sensor: mi.Sensor  # provides the time
-    picks: mi.DiscreteDistribution
+    bounds: tuple[float, ...]  # cumulative probabilities of starting at an emitter
     maps: tuple[mi.Emitter, ...]  # environment maps
 
     @staticmethod
@@ -65,13 +66,18 @@ class Emission:
         if not sum(weights) > 0:
             return None
         for each, weight in zip(emitters, weights, strict=True):
-            if weight > 0 and each.class_name() not in EMITTERS:
-                raise PathreplayError(
-                    f"no light path can start at emitter '{each.id()}' of class {each.class_name()}: leave it out, or "
-                    "trace all paths from the sensor"
-                )
+            if weight > 0:
+                _require_rays(each)
         maps = tuple(each for each in emitters if each.class_name() == MAP)
-        return Emission(scene, sensor, mi.DiscreteDistribution(mi.Float(weights)), maps)
+        return Emission(scene, sensor, tuple(sum(weights[: k + 1]) / sum(weights) for k in range(len(weights))), maps)
+
+    def pick(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        """Return the index of an emitter, a random number that is independent of it, and its probability."""
+        index, low, high = mi.UInt32(0), mi.Float(0), mi.Float(self.bounds[0])
+        for k, (a, b) in enumerate(pairwise(self.bounds)):
+            later = (u >= a) & (b > a)
+            index, low, high = dr.select(later, k + 1, index), dr.select(later, a, low), dr.select(later, b, high)
+        return index, (u - low) / (high - low), high - low
 
     def emit(self, trace: TraceConfig, u: EmitterSamples, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Sample a ray and its weight: emitted radiance times cosine, over density. Differentiable in the emitters.
@@ -79,7 +85,7 @@ class Emission:
         The point on a light has fixed coordinates there, and the direction is fixed in its frame. Both move with the
         light.
         """
-        index, again, probability = self.picks.sample_reuse_pmf(u.emitter, active)
+        index, again, probability = self.pick(u.emitter)
         emitter = dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index, active)
         time = mi.Float(self.sensor.shutter_open()) + u.time * self.sensor.shutter_open_time()
         ray, weight = emitter.sample_ray(time, again, u.place, u.direction, active)
@@ -96,6 +102,21 @@ class Emission:
         if trace.traits.lights_deform:
             weight *= _growth(trace, emitter, ray, active)
         return ray, weight * dr.detach(reciprocal(probability))
+
+
+def _require_rays(emitter: mi.Emitter) -> None:
+    """Raise PathreplayError unless the emitter can emit rays."""
+    known = emitter.class_name() in EMITTERS
+    try:
+        if known:
+            emitter.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
+    except RuntimeError:  # a texture that cannot be sampled
+        known = False
+    if not known:
+        raise PathreplayError(
+            f"no light path can start at emitter '{emitter.id()}': Mitsuba samples no rays of {emitter.class_name()}, or "
+            "of its texture; replace it, or trace all paths from the sensor"
+        )
 
 
 def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.transport.adjoint_bsdf import delta_adjoint, smooth_adjoint
 from pathreplay.transport.arrive import Vertex
 from pathreplay.transport.velocity import moved_direction
 from pathreplay.transport.vertex import (
@@ -69,8 +70,8 @@ def choose(
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
     f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(ctx, v.si, v.si.to_local(d), u.lobe, u.direction, at_surface)
     if ctx.mode == mi.TransportMode.Importance:
-        f *= shading_correction(v.si, v.si.to_local(d))
-        w *= shading_correction(v.si, sample.wo)
+        f = smooth_adjoint(v.bsdf, v.si, v.si.to_local(d), at_surface)
+        w = _adjoint_weight(v, sample, w, at_surface)
     delta, null = (mi.has_flag(sample.sampled_type, kind) for kind in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
     kept = SampledContinuation(
         v.si.to_world(sample.wo), sample.pdf, delta, dr.all(w == 0), sample.sampled_component, lit
@@ -100,12 +101,20 @@ def _in_medium(
     return Sampled(f, pdf_light, w, kept, null, dr.select(v.surface, surface.eta, 1), bounce | null)
 
 
+def _adjoint_weight(v: Vertex, sample: mi.BSDFSample3f, w: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
+    """Return the weight of a BSDF sample on a light path; ``w`` is the weight that Mitsuba returns."""
+    delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    f = smooth_adjoint(v.bsdf, v.si, sample.wo, active & ~delta)
+    smooth = dr.select(dr.any(dr.detach(w) != 0), f * reciprocal(sample.pdf), 0)
+    return dr.select(delta, w * delta_adjoint(v.si, sample.wo, sample.eta), smooth)
+
+
 def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
     """Evaluate scattering of light from the world direction ``d`` (Spectrum), and the density of sampling ``d``."""
     surface = active if v.inside is None else active & v.surface
     f, pdf = v.bsdf.eval_pdf(ctx, v.si, v.si.to_local(d), surface)
     if ctx.mode == mi.TransportMode.Importance:
-        f *= shading_correction(v.si, v.si.to_local(d))
+        f = smooth_adjoint(v.bsdf, v.si, v.si.to_local(d), surface)
     if v.inside is None:
         return f, pdf
     event = v.inside.event
@@ -142,6 +151,8 @@ def _at_surface(
 
     if trace.resamples:
         sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
+        if ctx.mode == mi.TransportMode.Importance:
+            w_sample = _adjoint_weight(v, sample, w_sample, active)
         if attached:
             free = _followed(trace, v, u, ctx, smooth)
             follows = free | (active & kept.delta)
@@ -154,6 +165,8 @@ def _at_surface(
         pdf = dr.replace_grad(kept.pdf, dr.select(smooth, pdf, 0))
     else:
         f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
+    if ctx.mode == mi.TransportMode.Importance:
+        f = smooth_adjoint(bsdf, si, wo, smooth)
     w = f * J * dr.detach(reciprocal(kept.pdf))
     # A failed sample has weight zero even if f is not zero (`roughdielectric` may reflect to the far side). The weight
     # of a black BSDF is also zero, but here f is zero, and the derivative of the weight is kept.
@@ -164,23 +177,7 @@ def _at_surface(
     if trace.traits.lobes > 0:
         delta = active & kept.delta
         w = dr.select(delta, _delta_weight(trace, v, u, ctx, kept, w_sample, delta), w)
-    if ctx.mode == mi.TransportMode.Importance:
-        w *= shading_correction(si, si.to_local(d))
     return w, d, pdf
-
-
-def shading_correction(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Float:
-    """Return the factor of a BSDF on light paths where the shading normal n_s differs from the geometric normal n_g.
-
-    Light arrives from ω_i and leaves along ω_o, in local coordinates ``si.wi`` and ``wo``. The factor makes light paths
-    the adjoint of camera paths [Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, p. 155]:
-
-        |(ω_i·n_s) (ω_o·n_g)| / |(ω_o·n_s) (ω_i·n_g)|
-    """
-    n = si.to_local(si.n)
-    above = mi.Frame3f.cos_theta(si.wi) * dr.dot(wo, n)
-    below = mi.Frame3f.cos_theta(wo) * dr.dot(si.wi, n)
-    return dr.select(below != 0, dr.abs(above) * dr.rcp(dr.abs(dr.select(below != 0, below, 1))), 0)
 
 
 def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
@@ -249,6 +246,8 @@ def _delta_weight(
         picked = missing if trace.traits.two_sides else missing & (kept.lobe == k)
         sample, w_k = v.bsdf.sample(alone, v.si, u.lobe, u.direction, picked)
         w_k *= dr.detach(reciprocal(kept.pdf))
+        if ctx.mode == mi.TransportMode.Importance:
+            w_k *= delta_adjoint(v.si, sample.wo, sample.eta)
         same = picked & (dr.squared_norm(dr.detach(sample.wo) - v.si.to_local(kept.d)) < SAME_LOBE)
         same &= dr.all(dr.abs(dr.detach(w_k) - drawn) <= SAME_LOBE * dr.abs(drawn))
         w = dr.select(same, w_k, w)

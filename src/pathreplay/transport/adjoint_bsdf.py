@@ -1,0 +1,43 @@
+"""BSDFs on light paths: the adjoint of the scattering that camera paths use.
+
+Camera paths weight light from ω_l, scattered into ω_c, by F = f(ω_c, ω_l) |ω_l·n_s|, with n_s the shading normal. A
+light path carries flux, which is proportional to the cosine with the geometric normal n_g. It therefore uses
+
+    F |ω_c·n_g| / |ω_l·n_g|        [Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, p. 155]
+
+Here F is evaluated exactly as on camera paths, with ``wi`` = ω_c and ``wo`` = ω_l. This includes BSDFs that perturb the
+normal (`bumpmap`, `normalmap`), whose n_s Mitsuba does not return. On light paths, ``si.wi`` is ω_l.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def smooth_adjoint(
+    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+) -> mi.Spectrum:
+    """Return the weight, times density, of scattering into the local direction ``wo`` by smooth lobes (Spectrum)."""
+    turned = mi.SurfaceInteraction3f(si)
+    turned.wi = wo
+    return bsdf.eval(mi.BSDFContext(), turned, si.wi, active) * _tilt(si, wo)
+
+
+def delta_adjoint(si: mi.SurfaceInteraction3f, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
+    """Return the factor of the weight of a delta lobe, which is sampled in importance mode.
+
+    The normal at which the light is reflected or refracted is parallel to h = ω_l + η ω_c, with η the relative index of
+    refraction across the lobe. Refraction changes solid angles by the ratio of the cosines with h.
+    """
+    cos = dr.dot(si.wi, wo)
+    a, b = 1 + eta * cos, cos + eta  # h·ω_l and h·ω_c
+    regular = (a != 0) & (b != 0)
+    return dr.select(regular, dr.abs(a) * dr.rcp(dr.abs(dr.select(regular, b, 1))), 1) * _tilt(si, wo)
+
+
+def _tilt(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Float:
+    n = si.to_local(si.n)
+    before = dr.abs(dr.dot(n, si.wi))
+    lit = before > 0
+    return dr.select(lit, dr.abs(dr.dot(n, wo)) * dr.rcp(dr.select(lit, before, 1)), 0)
