@@ -141,7 +141,7 @@ def forward_splat(
     footprint: Callable[[mi.Point2f], F],
     active: mi.Bool,
 ) -> tuple[Step, SplatTangent[F], mi.Spectrum, RayDerivative]:
-    """Evaluate a step of a light path again; return it with the tangents of its splat, its weight and its next arrival."""
+    """Evaluate a step of a light path again; return it with the tangents of its splat, weight and next arrival."""
     with dr.resume_grad():
         at = _with_tangent(v.at, tangent) if attached else v.at
         step = repeat_step(trace, replace(v, at=at), attached, active)
@@ -149,9 +149,7 @@ def forward_splat(
         on_film = footprint(step.splat.s)
         n = len(on_film.x)
         ray = step.ray_next
-        δc, δw, δo, δd, δpdf, *δh = tangents(
-            step.splat.c, step.w, ray.o, ray.d, step.pdf, *on_film.x, *on_film.y
-        )
+        δc, δw, δo, δd, δpdf, *δh = tangents(step.splat.c, step.w, ray.o, ray.d, step.pdf, *on_film.x, *on_film.y)
     splat = SplatTangent(dr.detach(step.splat.c), dr.detach(on_film), δc, δh[:n], δh[n:])
     return step, splat, δw, RayDerivative(δo, δd, δpdf)
 

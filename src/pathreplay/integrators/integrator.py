@@ -26,7 +26,7 @@ from pathreplay.integrators.film.pixel_passes import obstacle, pixel_loss, scatt
 from pathreplay.integrators.film.surface_flow import SurfaceFlow, can_follow
 from pathreplay.integrators.interior import PathReplay
 from pathreplay.integrators.lifetimes import is_recording
-from pathreplay.integrators.particle_term import ParticleTerm
+from pathreplay.integrators.particles.term import ParticleTerm
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.path_integrator import UNBOUNDED, PathIntegrator, reached
 from pathreplay.integrators.properties import choice, deviation, whole_number
@@ -152,9 +152,7 @@ class PathReplayIntegrator(PathIntegrator):
         trace = PathIntegrator._trace_config(self, scene, sensor, state)
         return trace if self.particles is None else replace(trace, without_caustics=True)
 
-    def _forward(
-        self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None
-    ) -> TermResult:
+    def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Compute the tangent of the image as the sum of all terms."""
         more = () if self.particles is None else (self.particles,)
         return PathIntegrator._forward(self, (*terms, *more), part, trace, learned)

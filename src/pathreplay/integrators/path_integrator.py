@@ -223,9 +223,7 @@ class PathIntegrator:
         """Render the image of a part of a pass."""
         return image(part, trace)
 
-    def _forward(
-        self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None
-    ) -> TermResult:
+    def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Compute the tangent of the image as the sum of all terms."""
         return reduce(add, [term.forward(part, trace, learned) for term in terms])
 

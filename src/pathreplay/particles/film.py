@@ -51,8 +51,8 @@ class ParticleFilm:
         film.prepare([])
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
             raise PathreplayError(
-                f"light paths cannot be added to the film of sensor '{sensor.id()}' of class {film.class_name()}, which "
-                "stores spectra: take an hdrfilm"
+                f"light paths cannot be added to the film of sensor '{sensor.id()}': a {film.class_name()} stores "
+                "spectra; take an hdrfilm"
             )
         filter, (width, height) = film.rfilter(), film.crop_size()
         name = str(filter)
@@ -79,7 +79,9 @@ class ParticleFilm:
             [filter.eval(first.y + k) for k in range(self.n)],
         )
 
-    def add(self, sums: mi.Float, at: Footprint, x: list[mi.Float], y: list[mi.Float], c: mi.Color3f, ok: mi.Bool) -> None:
+    def add(
+        self, sums: mi.Float, at: Footprint, x: list[mi.Float], y: list[mi.Float], c: mi.Color3f, ok: mi.Bool
+    ) -> None:
         """Add the colour ``c`` to the pixels of a footprint, weighted by ``x`` and ``y`` along the axes."""
         for column in range(self.n):
             for row in range(self.n):
@@ -148,7 +150,7 @@ def _length(filter: mi.ReconstructionFilter) -> float:
 def colour(c: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.Color3f:
     """Convert a radiance to the colour that films store, as Mitsuba does. Linear in the radiance."""
     if mi.is_spectral:
-        return mi.spectrum_to_srgb(c, wavelengths)
+        return mi.spectrum_to_srgb(c, wavelengths)  # type: ignore[attr-defined, no-any-return]  # spectral variants only
     return mi.Color3f(c.x) if mi.is_monochromatic else mi.Color3f(c)
 
 
@@ -159,6 +161,6 @@ def colour_adjoint(A: mi.Color3f, wavelengths: mi.Spectrum) -> mi.Spectrum:
         for k in range(len(result)):
             unit = mi.Spectrum(0)
             unit[k] = 1
-            result[k] = dr.dot(A, mi.spectrum_to_srgb(unit, wavelengths))
+            result[k] = dr.dot(A, colour(unit, wavelengths))
         return result
     return mi.Spectrum(A.x + A.y + A.z) if mi.is_monochromatic else mi.Spectrum(A)

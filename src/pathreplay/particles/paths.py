@@ -78,6 +78,7 @@ def particle_image(trace: TraceConfig, particles: Particles, film: ParticleFilm)
         sampler = start.sampler
         while dr.hint(path.active, exclude=[trace, film, sums, W], label="pathreplay: light path"):
             u, step = path.choose(trace, sampler)
+            assert step.splat is not None
             at, c = film.footprint(step.splat.s), W * path.β * step.splat.c
             film.add(sums, at, at.x, at.y, colour(c, path.at.ray.wavelengths), path.active & step.kept.lit)
             path = path.advance(trace, u, step)[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -62,7 +63,7 @@ class Emission:
         that cannot emit rays.
         """
         emitters = scene.emitters()
-        weights = [0.0 if caustics and each.is_environment() else float(each.sampling_weight()) for each in emitters]
+        weights = [0.0 if caustics and each.is_environment() else each.sampling_weight() for each in emitters]
         if not sum(weights) > 0:
             return None
         for each, weight in zip(emitters, weights, strict=True):
@@ -92,7 +93,7 @@ class Emission:
         if self.maps:
             # Mitsuba 3.9 does not rotate the disk of starting points with the map.
             box = self.scene.bbox()
-            radius = float(dr.norm(box.extents())) / 2
+            radius = 0.5 * math.sqrt(sum(float(x) ** 2 for x in box.extents()))
             disk = mi.warp.square_to_uniform_disk_concentric(u.place)
             start = mi.Frame3f(dr.detach(ray.d)).to_world(mi.Vector3f(disk.x, disk.y, 0)) - ray.d
             on_map = mi.Bool(False)
@@ -114,8 +115,8 @@ def _require_rays(emitter: mi.Emitter) -> None:
         known = False
     if not known:
         raise PathreplayError(
-            f"no light path can start at emitter '{emitter.id()}': Mitsuba samples no rays of {emitter.class_name()}, or "
-            "of its texture; replace it, or trace all paths from the sensor"
+            f"no light path can start at emitter '{emitter.id()}': Mitsuba samples no rays of {emitter.class_name()}, "
+            "or of its texture; replace it, or trace all paths from the sensor"
         )
 
 

@@ -19,7 +19,7 @@ from pathreplay.platform.device import backend_of
 #: Plugin name -> its Mitsuba plugin type, and the module and class of its template (see `on_base`).
 PLUGINS = {
     "pathreplay": ("integrator", "pathreplay.integrators.integrator", "PathReplayIntegrator"),
-    "pathreplay_particles": ("integrator", "pathreplay.integrators.particle_integrator", "ParticleIntegrator"),
+    "pathreplay_particles": ("integrator", "pathreplay.integrators.particles.integrator", "ParticleIntegrator"),
     "dielectric_ad": ("bsdf", "pathreplay.plugins.dielectric_ad", "DielectricAD"),
     "gridmedium": ("medium", "pathreplay.plugins.gridmedium", "GridMedium"),
 }

@@ -15,9 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 
-def smooth_adjoint(
-    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
-) -> mi.Spectrum:
+def smooth_adjoint(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
     """Return the weight, times density, of scattering into the local direction ``wo`` by smooth lobes (Spectrum)."""
     turned = mi.SurfaceInteraction3f(si)
     turned.wi = wo

@@ -11,7 +11,7 @@ from pathreplay.platform.traversal import known_values
 from pathreplay.transport import scatter
 from pathreplay.transport.arrive import Vertex
 from pathreplay.transport.facts.nodes import nodes_of, with_gradients
-from pathreplay.transport.start import CameraStart
+from pathreplay.transport.start import Start
 from pathreplay.transport.vertex import Arrival, SampledContinuation, TraceConfig, VertexRecord, VertexSamples
 
 FEW = 8
@@ -51,7 +51,7 @@ def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
     return moves & hit.is_valid()
 
 
-def path_moves(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
+def path_moves(trace: TraceConfig, start: Start, at: Arrival) -> bool:
     """Return whether hit points, sampled directions or emitter samples depend on parameters with gradients.
 
     ``at`` is the first arrival. Motion can enter at four places, which are checked: the start of the path, the shapes,
@@ -60,7 +60,7 @@ def path_moves(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
     return _depends(trace, start, at, painted=True)
 
 
-def edges_move(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
+def edges_move(trace: TraceConfig, start: Start, at: Arrival) -> bool:
     """Return whether visibility edges may move: occluders, path vertices or emitters depend on gradients.
 
     The test is the same as in `path_moves`, with two differences. Texture coordinates and the tangents computed from
@@ -72,7 +72,7 @@ def edges_move(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
     return turns or _depends(trace, start, at, painted=False)
 
 
-def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool) -> bool:
+def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bool:
     if trace.attach == "none":
         return False
     with dr.resume_grad():

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.meet import meet
-from pathreplay.transport.start import CameraStart, behind_emitters
+from pathreplay.transport.start import Start, behind_emitters
 from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples, reciprocal
 from pathreplay.transport.volume.passage import skip_null
@@ -32,7 +32,7 @@ class PathState:
     active: mi.Bool
 
     @staticmethod
-    def begin(trace: TraceConfig, start: CameraStart, sustained: bool = False) -> PathState:
+    def begin(trace: TraceConfig, start: Start, sustained: bool = False) -> PathState:
         """Start paths at their first vertices; if ``sustained``, zero weights do not end paths with derivatives."""
         active = mi.Bool(start.active) & (trace.max_depth > 0)
         β_alive = mi.Spectrum(1) if sustained else None

@@ -1,8 +1,9 @@
-"""Start: the camera ray of a path, and its first arrival."""
+"""Start: the first ray of a path, and its first arrival."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,19 @@ from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.meet import meet, short_of_end
 from pathreplay.transport.vertex import Arrival, TraceConfig
 from pathreplay.transport.volume.passage import skip_null
+
+
+class Start(Protocol):
+    """The start of paths, at the sensor or at emitters."""
+
+    sampler: Sampler  # source of the random numbers of the paths
+    active: mi.Bool
+
+    def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
+        """Find the first arrival along the rays, detached."""
+
+    def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Return origin and direction of the rays, differentiably."""
 
 
 @dataclass

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import mitsuba as mi
 
-from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.integrator import PathReplayIntegrator
+from pathreplay.integrators.particles.term import ParticleTerm
 from pathreplay.integrators.pass_state import PassState
-from pathreplay.integrators.particle_term import ParticleTerm
 from pathreplay.integrators.path_integrator import PathIntegrator
 from pathreplay.integrators.properties import whole_number
 from pathreplay.transport.vertex import TraceConfig
