@@ -147,6 +147,10 @@ class PathReplayIntegrator(PathIntegrator):
         lit = None if self.particles is None else self.particles.image(part, trace)
         return image if lit is None else image + lit
 
+    def _camera_view(self, view: Pass) -> Pass:
+        """Return the pass of the camera paths."""
+        return view
+
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
         """Build the trace configuration of camera paths, without caustics if light paths add these."""
         trace = PathIntegrator._trace_config(self, scene, sensor, state)
@@ -154,8 +158,10 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Compute the tangent of the image as the sum of all terms."""
-        more = () if self.particles is None else (self.particles,)
-        return PathIntegrator._forward(self, (*terms, *more), part, trace, learned)
+        if self.particles is None:
+            return PathIntegrator._forward(self, terms, part, trace, learned)
+        camera = [term.forward(self._camera_view(part), trace, learned) for term in terms]
+        return reduce(add, camera, self.particles.forward(part, trace, learned))
 
     def _backward(
         self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None
@@ -164,9 +170,9 @@ class PathReplayIntegrator(PathIntegrator):
         if self.particles is None:
             return PathIntegrator._backward(self, terms, part, trace, grad_in, learned)
         unreached, results = [], []
-        for some in ((self.particles,), terms):
+        for some, view in (((self.particles,), part), (terms, self._camera_view(part))):
             try:
-                results.append(PathIntegrator._backward(self, some, part, trace, grad_in, learned))
+                results += [term.backward(view, trace, grad_in, learned) for term in some]
             except Unreached as error:
                 unreached.append(error)
         if not results:

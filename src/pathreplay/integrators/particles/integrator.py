@@ -6,19 +6,31 @@ from dataclasses import replace
 
 import mitsuba as mi
 
+from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.integrator import PathReplayIntegrator
 from pathreplay.integrators.particles.term import ParticleTerm
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.path_integrator import PathIntegrator
 from pathreplay.integrators.properties import whole_number
+from pathreplay.integrators.term import Term
 from pathreplay.transport.vertex import TraceConfig
+
+MOST_RAYS = 2**20
+LEAST_A_PIXEL = 16
+
+
+def _few_rays(view: Pass) -> Pass:
+    """Limit the number of camera rays of a pass."""
+    width, height = view.size
+    return replace(view, spp=min(view.spp, max(MOST_RAYS // (width * height), LEAST_A_PIXEL)))
 
 
 class ParticleIntegrator(PathReplayIntegrator):
     """Differentiable particle tracer for surfaces.
 
-    Light paths start at the emitters and are connected to the sensor at every vertex. Emitters that the sensor sees
-    directly are rendered with camera rays, one segment long.
+    Light paths start at the emitters and are connected to the sensor at every vertex. Their number is the number of
+    pixels times the samples per pixel. Emitters that the sensor sees directly are rendered with camera rays: 2^20 in
+    all or 16 per pixel, unless there are fewer samples.
 
     Properties, with the default first:
 
@@ -29,7 +41,7 @@ class ParticleIntegrator(PathReplayIntegrator):
     - ``attach``, ``boundary`` and ``boundary_spp``: as in `PathReplayIntegrator`. The boundary term contains the edges
       of directly visible emitters only.
 
-    The number of light paths is the number of pixels times the samples per pixel. Sensors: ``perspective``,
+    Sensors: ``perspective``,
     ``thinlens``, ``orthographic`` and ``irradiancemeter``. The image is that of a film with ``sample_border = true``
     (see `ParticleFilm`).
 
@@ -39,11 +51,30 @@ class ParticleIntegrator(PathReplayIntegrator):
     """
 
     name = "pathreplay_particles"
+    particles: ParticleTerm
 
     def __init__(self, props: mi.Properties) -> None:
         whole_number(props, self.name, "samples_per_pass", -1, lowest=1, unbounded=True, kind="number of samples")
         PathReplayIntegrator.__init__(self, props)
         self.particles = ParticleTerm(self.max_depth, caustics=False)
+
+    def _image(self, part: Pass, trace: TraceConfig) -> mi.TensorXf:
+        """Render the image of directly visible emitters and of light paths."""
+        lit = self.particles.image(part, trace)
+        image = PathIntegrator._image(self, _few_rays(part), trace)
+        return image if lit is None else image + lit
+
+    def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
+        """Leave out the terms of the camera rays if the sensor can see no emitter."""
+        trace = self._trace_config(view.scene, view.sensor, state)
+        shines = trace.traits.area_lights or view.scene.environment() is not None
+        if self.hide_emitters or not shines:
+            return view, trace, ()
+        return PathReplayIntegrator._planned(self, view, state, follow)
+
+    def _camera_view(self, view: Pass) -> Pass:
+        """Return the pass of the camera rays."""
+        return _few_rays(view)
 
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
         """Return the configuration of the camera rays, which see emitters directly."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.adjoint.autodiff import NonFiniteCounter
+from pathreplay.adjoint.autodiff import NonFiniteCounter, Unreached
 from pathreplay.adjoint.baseline import Baseline
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass
@@ -49,7 +49,7 @@ class ParticleTerm:
         """Back-propagate the adjoint of the image: see `Term`."""
         work, lost = self._work(view, trace), NonFiniteCounter()
         if work is None:
-            return TermResult()
+            raise Unreached("no light path starts at an emitter of the scene")
         moves = particle_sweep(*work, grad_in, lost)
         dr.eval()
         return self._result(work[1], lost, moves)
