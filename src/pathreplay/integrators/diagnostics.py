@@ -64,6 +64,21 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
         yield f"attach = 'all' keeps the directions of {', '.join(traits.detached_names)} fixed"
 
 
+def particle_notes(trace: TraceConfig, sensor: mi.Sensor) -> Iterator[str]:
+    """Yield messages about what the gradient of moving light paths does not contain."""
+    if sensor.film().rfilter().is_box_filter():
+        yield (
+            f"the film of sensor '{sensor.id()}' has a box filter, whose derivative is zero: the motion of light paths "
+            "across pixels is missing from the gradient; use a 'tent' or 'gaussian' filter"
+        )
+    moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
+    if moving:
+        yield (
+            f"'{moving[0]}' moves, and light paths leave out moving edges (outlines and shadows that light "
+            "from emitters meets, or that hide it from the sensor): measure the error with 'pathreplay check'; see docs/particles.md"
+        )
+
+
 def missing_edges(trace: TraceConfig, sensor: mi.Sensor, edges: str) -> tuple[str, bool]:
     """Format the message about moving edges whose boundary term is left out ("" if there is none to report).
 

@@ -19,7 +19,14 @@ from pathreplay.adjoint.record import MAX_DEPTH
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.boundary_term import Boundary
 from pathreplay.integrators.camera_pass import Pass, Seed, Which
-from pathreplay.integrators.diagnostics import COST_OF_EDGES, doubts, lost_note, missing_edges, used_before_note
+from pathreplay.integrators.diagnostics import (
+    COST_OF_EDGES,
+    doubts,
+    lost_note,
+    missing_edges,
+    particle_notes,
+    used_before_note,
+)
 from pathreplay.integrators.film.camera_flow import CameraFlow
 from pathreplay.integrators.film.motion import FilmMotion
 from pathreplay.integrators.film.pixel_passes import obstacle, pixel_loss, scatter_rows
@@ -367,6 +374,9 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
         """Log a note about moving edges whose boundary term is left out: see `PathIntegrator`."""
+        if self.particles is not None and result.moves:
+            for note in particle_notes(trace, view.sensor):
+                self._warn_once(note)
         if not result.moves or EDGES in self.warned or self.boundary in ("auto", "all"):
             return
         note, named = missing_edges(trace, view.sensor, self.boundary)
