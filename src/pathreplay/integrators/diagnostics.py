@@ -74,8 +74,9 @@ def particle_notes(trace: TraceConfig, sensor: mi.Sensor) -> Iterator[str]:
     moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
     if moving:
         yield (
-            f"'{moving[0]}' moves, and light paths leave out moving edges (outlines and shadows that light "
-            "from emitters meets, or that hide it from the sensor): measure the error with 'pathreplay check'; see docs/particles.md"
+            f"'{moving[0]}' moves, and light paths leave out moving edges (outlines and shadows that light from "
+            "emitters meets, or that hide it from the sensor): measure the error with 'pathreplay check'; see "
+            "docs/particles.md"
         )
 
 
