@@ -183,12 +183,38 @@ class Parameter(Table):
         raise ValueError(f"parameter '{self.key}': {why}")
 
 
+class Displace(Table):
+    """Displacement of the vertices of a mesh by a height map."""
+
+    direction: Literal["normal"] | Vector = "normal"
+    """Direction of positive heights: the normal at each vertex of the mesh in the scene, or a vector."""
+    coordinates: Literal["uv", "xy", "xz", "yx", "yz", "zx", "zy"] = "uv"
+    """Coordinates on the height map: the texture coordinates, or two axes, along which it spans the whole mesh."""
+    interpolation: Literal["linear", "cubic"] = "linear"
+    """Interpolation of the height map: linear, or by cubic B-splines, whose slopes and curvatures are continuous."""
+    weights: str | None = None
+    """Attribute of the mesh, such as 'vertex_weight', whose numbers multiply the heights; default: 1 everywhere."""
+
+
 class Derivation(Table):
-    """A scene parameter, or several that match a glob, computed from other parameters by a user function."""
+    """A scene parameter, or several that match a glob, computed from other parameters."""
 
     key: str
-    """Scene parameter that the function computes, or a glob."""
-    function: ImportPath
+    """Scene parameter that is computed, or a glob."""
+    function: ImportPath | None = None
     """Function as module:function; its arguments are the value in the scene and the parameters in 'of'."""
+    displace: Displace | None = None
+    """Displacement of the vertex_positions of a mesh by the height map in 'of', in place of a function."""
     of: Annotated[list[str], Field(min_length=1)]
     """Parameters of the job, in the order of the function's arguments."""
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Derivation:
+        if (self.function is None) == (self.displace is None):
+            given = "neither 'function' nor 'displace'" if self.function is None else "both 'function' and 'displace'"
+            raise ValueError(f"derived '{self.key}': it has {given}; give one of them")
+        if self.displace is not None and len(self.of) != 1:
+            raise ValueError(
+                f"derived '{self.key}': 'displace' takes one height map, but 'of' names {len(self.of)}; name one"
+            )
+        return self

@@ -18,6 +18,7 @@ _TITLES = {
     "Displacement": "initial = { ... } for a pose",
     "ImageValue": "{ image = ... }",
     "Derivation": "[[derived]]",
+    "Displace": "displace = { ... }",
     "Target": "[target]",
     "Capture": "[capture]",
     "Exposure": "[exposure]",
