@@ -104,7 +104,7 @@ def _renamed(key: str, table: type[BaseModel]) -> str | None:
     return next((name for name in RENAMED.get(key, "").split() if name in table.model_fields), None)
 
 
-_ALTERNATIVES = ("int", "float", "bool", "str", "count", "ImageValue", "Value", "Displacement")
+_ALTERNATIVES = ("int", "float", "bool", "str", "count", "ImageValue", "Value", "Displacement", "TransportStart")
 
 
 def _path(loc: tuple[int | str, ...]) -> list[str]:

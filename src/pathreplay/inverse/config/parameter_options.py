@@ -55,16 +55,47 @@ class Displacement(Table):
     """Rotation vector in degrees."""
 
 
+class TransportStart(Table):
+    """A height map whose caustic is an image, by optimal transport (`pathreplay.caustic_heights`)."""
+
+    transport: str
+    """Image file, or 'matplotlib:NAME' for a sample image of matplotlib; it is converted to grey."""
+    width: Positive
+    """Width of the exit surface in scene units."""
+    distance: Positive
+    """Distance from the exit surface to the receiver in scene units."""
+    eta: Annotated[Finite, Field(gt=1)]
+    """Index of refraction of the slab relative to its surroundings."""
+    receiver_width: Positive | None = None
+    """Width of the image on the receiver in scene units; default: the width of the exit surface."""
+    source_distance: Positive | None = None
+    """Distance from a point light on the axis to the entry surface; default: collimated light."""
+    thickness: Annotated[Finite, Field(ge=0)] = 0.0
+    """Distance from the entry surface to the exit surface, which matters for a point light only."""
+    floor: Annotated[Finite, Field(gt=0, lt=1)] = 0.02
+    """Fraction of the light that is distributed evenly."""
+    fit: Literal["stretch", "crop"] = "stretch"
+    """'stretch' resamples the image to the shape of the map. 'crop' first crops the image to this aspect ratio."""
+    raw: Switch = False
+    """Use the stored values without decoding them from sRGB."""
+
+
 def _kind_of_initial(value: object) -> str:
+    if isinstance(value, TransportStart) or (isinstance(value, dict) and "transport" in value):
+        return "TransportStart"
     names = list(value) if isinstance(value, dict) else []
     posed = any(difflib.get_close_matches(str(name), Displacement.model_fields, n=1) for name in names)
     return "Displacement" if posed or isinstance(value, Displacement) else "Value"
 
 
 Initial = Annotated[
-    Annotated[Value, Tag("Value")] | Annotated[Displacement, Tag("Displacement")], Discriminator(_kind_of_initial)
+    Annotated[Value, Tag("Value")]
+    | Annotated[Displacement, Tag("Displacement")]
+    | Annotated[TransportStart, Tag("TransportStart")],
+    Discriminator(_kind_of_initial),
 ]
-"""Initial value of a parameter or, for a pose, its initial displacement relative to the scene."""
+"""Initial value of a parameter; for a pose, its initial displacement relative to the scene; for a height map, the image
+of its caustic."""
 
 
 NOT_OF_A_POSE = frozenset(
@@ -86,7 +117,7 @@ class Parameter(Table):
     """Learning rate of this parameter; default: the learning rate of the job."""
     initial: Initial | None = None
     """Initial value: a number, a list (a colour), an image or volume file, or an image table; for a pose, a
-    displacement. Default: the value in the scene."""
+    displacement; for a height map, also the image of its caustic. Default: the value in the scene."""
     resolutions: Annotated[list[Count], Field(min_length=1)] | None = None
     """Resolutions of a texture or volume, coarse to fine, as the number of entries along its longest axis."""
     refine_at: list[Count] | None = None
