@@ -19,6 +19,13 @@ MOST_RAYS = 2**20
 LEAST_A_PIXEL = 16
 
 
+def _shines(emitter: mi.Emitter) -> bool:
+    """Return whether a sensor can see an emitter."""
+    flags = emitter.flags()
+    on_surface = mi.has_flag(flags, mi.EmitterFlags.Surface) and not mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
+    return on_surface or emitter.is_environment()
+
+
 def _few_rays(view: Pass) -> Pass:
     """Limit the number of camera rays of a pass."""
     width, height = view.size
@@ -66,10 +73,8 @@ class ParticleIntegrator(PathReplayIntegrator):
 
     def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """Leave out the terms of the camera rays if the sensor can see no emitter."""
-        trace = self._trace_config(view.scene, view.sensor, state)
-        shines = trace.traits.area_lights or view.scene.environment() is not None
-        if self.hide_emitters or not shines:
-            return view, trace, ()
+        if self.hide_emitters or not any(map(_shines, view.scene.emitters())):
+            return view, self._trace_config(view.scene, view.sensor, state), ()
         return PathReplayIntegrator._planned(self, view, state, follow)
 
     def _camera_view(self, view: Pass) -> Pass:
