@@ -8,16 +8,18 @@ READY := $(VENV)/.ready
 PYTEST := -q --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-hours coverage lint bench clean
+.PHONY: help demo test test-all test-hours test-lowest coverage lint bench release clean
 
 help:
 	@echo "make demo      recover a texture, two wall colours and a light from rendered pictures, write a report"
 	@echo "make test      lint and the quick tests, with kernels that LLVM does not optimise"
 	@echo "make test-all  lint and every test but those that take hours, with kernels as users have them"
 	@echo "make test-hours  those: tails of all cells in 256 passes each, 300 random scenes in one process"
+	@echo "make test-lowest  a selection of the tests, with the lowest supported version of each dependency"
 	@echo "make coverage  lines of the package that the quick tests run"
 	@echo "make lint      ruff and mypy"
 	@echo "make bench     time, memory and variance next to Mitsuba's own integrators"
+	@echo "make release   build wheel and source archive, and run the demo from the wheel in an empty environment"
 	@echo "make clean     remove .venv and caches, keep runs/"
 	@echo "Another Python: make demo PYTHON=python3.12"
 
@@ -64,6 +66,10 @@ coverage: $(READY)
 # TASKS='surface --quick' and the like: see benchmarks/__main__.py; without it all of them, in full.
 bench: $(READY)
 	$(BIN)/python -m benchmarks $(TASKS)
+
+# Environments of its own for the tools and for the wheel: the versions of the tools are in constraints.txt.
+release: $(READY)
+	$(BIN)/python .ci/release.py
 
 clean:
 	rm -rf $(VENV) .coverage .pytest_cache .ruff_cache .mypy_cache build src/*.egg-info
