@@ -21,7 +21,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 DIST = ROOT / "dist"
-TOOLS = ("build", "twine")
+TOOLS = ("build", "twine")  # their versions are in constraints.txt
 DEMO = "examples/cornell-photo/config.toml"
 #: Where each version is written. Each pattern matches once.
 VERSIONS = {

@@ -53,7 +53,7 @@ def test_results_of_examples_are_left_out(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_no_examples_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(examples, "_PACKAGE", tmp_path / "src/pathreplay")
-    with pytest.raises(PathreplayError, match="no examples .* install pathreplay again"):
+    with pytest.raises(PathreplayError, match=r"no examples .* install pathreplay again"):
         example_files()
 
 
