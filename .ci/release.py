@@ -49,11 +49,11 @@ def require_clean() -> None:
         sys.exit(f"release: error: commit or remove these first:\n{changed.stdout.rstrip()}")
 
 
-def run(command: Sequence[str | Path], cwd: Path, environment: Mapping[str, str] | None = None) -> None:
+def run(command: Sequence[str | Path], cwd: Path, variables: Mapping[str, str] | None = None) -> None:
     """Print a command and run it. Exits if it fails."""
     words = [str(word) for word in command]
     print(f"release: {Path(words[0]).name} {' '.join(words[1:])}", flush=True)
-    status = subprocess.run(words, cwd=cwd, env=environment).returncode
+    status = subprocess.run(words, cwd=cwd, env=variables).returncode
     if status:
         sys.exit(f"release: error: the command above failed (status {status})")
 
