@@ -261,6 +261,16 @@ def export(
     typer.echo(export_run(run, output))
 
 
+@app.command(short_help="Write out the examples.")
+def examples(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="New folder.")] = Path("examples"),
+) -> None:
+    """Write the examples into a new folder: jobs with their scenes, scripts and explanations."""
+    from pathreplay.output.examples import write_examples
+
+    typer.echo(write_examples(folder))
+
+
 @app.command(short_help="Print the JSON schema of a job.")
 def schema(
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a Markdown page of all keys instead.")] = False,

@@ -239,6 +239,10 @@ class TensorXf(_Array[TensorXf | _Number, TensorXf | _Number, TensorXb]):
     def __getitem__(self, key: Any) -> TensorXf: ...
     def __setitem__(self, key: Any, value: TensorXf | _Number) -> None: ...
 
+class TensorXu(_Array[TensorXu | _Integer, TensorXu | _Integer, TensorXb]):
+    array: UInt32
+    def __init__(self, *values: Any, shape: Sequence[int] = ...) -> None: ...
+
 class TensorXf16(_Array[Any, Any, TensorXb]):
     array: dr.ArrayBase
 

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import tangents
+from pathreplay.platform import compat
 from pathreplay.transport.emitters import emission
 from pathreplay.transport.path import PathState
 from pathreplay.transport.step import repeat_step
@@ -126,7 +127,7 @@ def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active:
         with dr.resume_grad(x[k]):
             pdf, slide = x
             ray = mi.Ray3f(at.ray)
-            si = at.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            si = at.hit.compute_surface_interaction(ray, compat.shading(), active)
             ray.o = ray.o + ray.d * slide
             slid = replace(at, ray=ray, pdf=pdf)
             e = dr.sum(weight * emission(trace.scene, slid, si, True, active))

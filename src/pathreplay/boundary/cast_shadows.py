@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.boundary.edges import FilmDomain
+from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of
 from pathreplay.transport.facts.nodes import is_mesh
 from pathreplay.transport.meet import meet
@@ -46,7 +47,7 @@ def cast_shadows(
     hit = meet(trace, ray, active)
     n = mi.UInt32(0)
     while dr.hint(active & (hit.shape == shape) & (n < THROUGH), exclude=[trace], label="pathreplay: cast a shadow"):
-        ray = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, mi.Bool(True)).spawn_ray(ray.d)
+        ray = hit.compute_surface_interaction(ray, compat.minimal(), mi.Bool(True)).spawn_ray(ray.d)
         hit = meet(trace, ray, mi.Bool(True))
         n += 1
     s, inside = film.of_point(ray.o + hit.t * ray.d)

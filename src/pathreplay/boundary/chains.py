@@ -15,6 +15,7 @@ from pathreplay.adjoint.record import Layout, record, record_type
 from pathreplay.boundary.crofton import VisibilityProbe
 from pathreplay.boundary.edges import EdgePath
 from pathreplay.boundary.hard_shadows import ShadowTest, sample_light
+from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import may_move
@@ -71,7 +72,7 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
 
 def _probe_vertex(trace: TraceConfig, path: PathState, key: mi.UInt32, active: mi.Bool) -> VisibilityProbe:
     at = path.at
-    flags = mi.RayFlags.All if trace.traits.coarse_meshes else mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
+    flags = compat.shading() if trace.traits.coarse_meshes else compat.shading_frame()
     si = at.hit.compute_surface_interaction(at.ray, flags, active)
     if not trace.traits.copies:
         si.shape = at.hit.shape
@@ -193,7 +194,7 @@ def transmittance_of_chain(
         part, medium = transmittance_up_to(trace, path.at.ray, length, medium, transmittance_sampler, path.active)
         T *= part
         u, step = path.choose(chain, sampler)
-        si = path.at.hit.compute_surface_interaction(path.at.ray, mi.RayFlags.All, path.active & ~last)
+        si = path.at.hit.compute_surface_interaction(path.at.ray, compat.shading(), path.active & ~last)
         turns = path.active & ~last & si.is_valid() & si.is_medium_transition()
         medium = dr.select(turns, si.target_medium(step.kept.d), medium)
         path = path.advance(chain, u, step)[0]

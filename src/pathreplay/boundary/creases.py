@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from pathreplay.boundary.crofton import at_an_angle, hides_itself
 from pathreplay.boundary.hard_shadows import HardShadow
+from pathreplay.platform import compat
 from pathreplay.transport.meet import meet
 from pathreplay.transport.signature import place_met, shape_met, turned_away
 from pathreplay.transport.vertex import Arrival, TraceConfig
@@ -46,7 +47,7 @@ class Crease:
         both = active & a.is_valid() & b.is_valid()
         if shadow is not None:
             both &= ~shadow.exists
-        flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
+        flags = compat.shading_frame()
         si_a, si_b = (hit.compute_surface_interaction(ray, flags, both) for hit, ray in (side_a, side_b))
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
         same = both & (place_met(trace, a, both, si_a.shape) == place_met(trace, b, both, si_b.shape))
@@ -62,8 +63,8 @@ class Crease:
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """Evaluate B, which is zero on the edge and in lanes without an edge. Differentiable in ray and shapes."""
         meets, turns = active & self.meets, active & self.turns
-        t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, meets).t for hit in (self.a, self.b)]
-        si = self.a.compute_surface_interaction(ray, mi.RayFlags.All, turns)
+        t = [hit.compute_surface_interaction(ray, compat.shading(), meets).t for hit in (self.a, self.b)]
+        si = self.a.compute_surface_interaction(ray, compat.shading(), turns)
         B = dr.select(meets, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), 0))
         return B if self.shadow is None else dr.select(self.shadow.exists, self.shadow.gap(ray, active), B)
 
@@ -76,7 +77,7 @@ def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> 
     The error of moving the hits is therefore proportional to the distance by which they move, some thousandths of the
     size of objects.
     """
-    sides = [(at, at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal, active)) for at in (a, b)]
+    sides = [(at, at.hit.compute_surface_interaction(at.ray, compat.minimal(), active)) for at in (a, b)]
     normals = [dr.select(dr.dot(si.n, at.ray.d) > 0, -si.n, si.n) for at, si in sides]
     contact, cosine = dr.cross(*normals), dr.dot(*normals)
     ok = active & a.hit.is_valid() & b.hit.is_valid() & at_an_angle(*normals)

@@ -32,6 +32,7 @@ from pathreplay.boundary.crofton import (
 )
 from pathreplay.boundary.importance import STEEP, Importance, closeness, own_plane
 from pathreplay.boundary.observer import ObserverVertex
+from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.signature import edge_normal, outline_gap
@@ -168,7 +169,7 @@ class EmitterSegment(PlaneSegment):
         on_emitter = in_cone & first.is_valid() & (first.shape.emitter() == emitter.ptr)
         hit = dr.select(on_emitter, first, observer.behind(ray, first, tested & ~on_emitter))
         seen = in_cone & hit.is_valid() & (hit.shape.emitter() == emitter.ptr)
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, seen)
+        si = hit.compute_surface_interaction(ray, compat.shading(), seen)
         on_mesh = mi.DirectionSample3f(trace.scene, si=si, ref=observer.origin)
         on_mesh.d = d
         light, density = dr.select(in_cone, on_mesh, light), dr.select(in_cone, 0, light.pdf)

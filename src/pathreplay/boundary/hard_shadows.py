@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.transport.emitters import draw_emitter
 from pathreplay.transport.meet import meet
@@ -35,7 +36,7 @@ class ShadowTest:
     def of(trace: TraceConfig, at: Arrival, sampler: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
         """Test whether a path's k-th vertex receives light from its emitter sample; ``sampler`` is at this vertex."""
         u = VertexSamples.draw(sampler).light
-        si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+        si = at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
         test = ShadowTest.at(trace, si, u, _scatters(trace, si, k, active))
         test.met = at.hit
         return test
@@ -81,7 +82,7 @@ class HardShadow:
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """Evaluate B, zero on the shadow boundary, at the hit of ``ray``. Differentiable in ray, shapes and light."""
         assert self.test.met is not None
-        si = self.test.met.compute_surface_interaction(ray, mi.RayFlags.All, active & self.exists)
+        si = self.test.met.compute_surface_interaction(ray, compat.shading(), active & self.exists)
         return self.gap_at(si, active)
 
     def gap_at(self, x: mi.Interaction3f, active: mi.Bool) -> mi.Float:

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.record import Layout, record
+from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport import arrive, scatter
@@ -118,7 +119,7 @@ class ObserverVertex:
         self.origin: mi.Interaction3f
         self.si: mi.SurfaceInteraction3f
         if trace.media is None:
-            self.origin = self.si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+            self.origin = self.si = at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
         else:
             # With a given flight, no random numbers are needed, and the sampler may be None.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]

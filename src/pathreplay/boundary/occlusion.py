@@ -20,6 +20,7 @@ from pathreplay.boundary.edges import Crossing
 from pathreplay.boundary.hard_shadows import HardShadow, ShadowTest
 from pathreplay.boundary.importance import DIM, Importance, closeness, own_plane
 from pathreplay.boundary.observer import ObserverVertex
+from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import may_move
@@ -50,7 +51,7 @@ class ArcSegment(Arc):
         close = active & counts  # lanes in which the surface is evaluated
         if trace.media is None:
             close &= moves
-        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, close)
+        at = seen.compute_surface_interaction(ray, compat.shading_frame(), close)
         if not trace.traits.copies:
             at.shape = seen.shape
         turned = dr.select(turned_away(at, ray.d), mi.UInt32(1), 0)

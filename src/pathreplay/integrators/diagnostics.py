@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.edge_notes import edges_note, keys_that_move_edges
+from pathreplay.platform import compat
 from pathreplay.transport.vertex import TraceConfig
 
 COST_OF_EDGES = (
@@ -41,7 +42,7 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
     if traits.instances_move and trace.attach != "none":
         raise PathreplayError(
             "pathreplay: an instance's to_world has a gradient, but Mitsuba does not differentiate the normals "
-            "of instances: move the vertex_positions of the shapes in its group, or use a shape of its own"
+            f"of instances: move the {compat.positions_name()} of the shapes in its group, or use a shape of its own"
         )
     if traits.masks_mirrors:
         yield (

@@ -7,10 +7,11 @@ from collections.abc import Iterable
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.platform import compat
 from pathreplay.scenes.parameters import needs_ray_adjoint
 
 # Parameters that move points of a surface. Other parameters with this effect have Mitsuba's flag `Discontinuous`.
-_POSITIONS = {"vertex_positions", "to_world", "control_points"}
+_POSITIONS = {*compat.POSITIONS, "to_world", "control_points"}
 
 
 def moves_edges(params: mi.SceneParameters, key: str) -> bool:
@@ -20,7 +21,7 @@ def moves_edges(params: mi.SceneParameters, key: str) -> bool:
     """
     node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
     if isinstance(node, mi.Shape):
-        marked = bool(params.flags(key) & mi.ParamFlags.Discontinuous) and name != "vertex_normals"
+        marked = bool(params.flags(key) & mi.ParamFlags.Discontinuous) and name not in compat.NORMALS
         return name in _POSITIONS or marked
     if isinstance(node, mi.Emitter) and not mi.has_flag(node.flags(), mi.EmitterFlags.Delta):
         return False  # an environment emitter

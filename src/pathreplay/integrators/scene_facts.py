@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.integrators.lifetimes import SCENES, is_recording
+from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of, with_gradients
 from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
@@ -79,7 +80,7 @@ class SceneFacts:
         return replace(
             self._traits,
             tables=self.tables() if tables is None else tables,
-            lights_deform=any(with_gradients(mesh, "vertex_positions") for mesh in self._mesh_emitters),
+            lights_deform=any(with_gradients(mesh, *compat.POSITIONS) for mesh in self._mesh_emitters),
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
             opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
             lights_vary=any(map(with_gradients, self._emitters)),

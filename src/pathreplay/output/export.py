@@ -23,7 +23,7 @@ from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.pose import PART_NAMES
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.output.scene_folder import SCENE, Exported, Source, exported, require_same
-from pathreplay.platform import backend
+from pathreplay.platform import backend, compat
 from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.platform.files import file_names
 from pathreplay.platform.traversal import traversed
@@ -176,13 +176,14 @@ def _json(table: object) -> bytes:
 
 def obj_bytes(mesh: mi.Mesh) -> bytes:
     """Encode the mesh as a Wavefront OBJ file: vertices, texture coordinates, normals, faces."""
-    params = mi.traverse(mesh)
+    data = compat.mesh_arrays(mi.traverse(mesh))
+    if data is None:
+        raise PathreplayError(f"The vertices of shape '{mesh.id()}' are not accessible, so it cannot be written as OBJ")
     lines, has = [], []
-    for key, tag, width in (("positions", "v", 3), ("texcoords", "vt", 2), ("normals", "vn", 3)):
-        rows = get_array(params[f"vertex_{key}"]).reshape(-1, width)
+    for rows, tag in ((data.positions, "v"), (data.texcoords, "vt"), (data.normals, "vn")):
         has.append(len(rows) > 0)
         lines += [f"{tag} " + " ".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
-    for face in np.array(params["faces"]).reshape(-1, 3) + 1:
+    for face in data.faces + 1:
         corners = (f"{i}/{i if has[1] else ''}/{i if has[2] else ''}".rstrip("/") for i in face)
         lines.append("f " + " ".join(corners))
     return ("\n".join(lines) + "\n").encode()

@@ -10,13 +10,13 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.output.nodes import Described, Node, Owner
+from pathreplay.platform import compat
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.parameters import get_array
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.volume_files import UNIT_CUBE, Bounds, vol_bounds, vol_bytes
 
 _PICTURES = ("bitmap", "envmap")
-_OF_A_MESH = ("vertex_", "faces", "face_")
 _MADE_BY = ("filename", "bitmap", "grid", "data", "shape_index")
 """Properties that say where the values of a texture, grid or mesh come from."""
 _ALSO_PLACES = {
@@ -53,7 +53,7 @@ class Placing:
             self._texture(key, node)
         elif plugin == "gridvolume" and place == "data":
             self._volume(key, node)
-        elif place.startswith(_OF_A_MESH):
+        elif compat.is_mesh_data(place):
             self._mesh(self.params.properties[key][2], node)
         elif place == "to_world":
             _remove(node.props, *_ALSO_PLACES.get(plugin, ()))
@@ -116,7 +116,7 @@ class Placing:
         properties.set_id(name)
         shape = next((shape for shape in self.scene.shapes() if shape.id() == name), mesh)
         properties["filename"] = self._ply(shape, name)
-        if not mesh.has_vertex_normals():
+        if not compat.has_normals(mesh):
             properties["face_normals"] = True
         for part, instance in (("bsdf", shape.bsdf()), ("emitter", shape.emitter())):
             if instance is not None:

@@ -107,7 +107,7 @@ class Recovered:
     truth: Array | None
     baseline: Array | None = None
     faces: NDArray[np.integer] | None = None
-    """Vertex indices of m faces (3m numbers), if the parameter consists of the vertices of a mesh."""
+    """Vertex indices of the faces, (m, 3), if the parameter consists of the vertices of a mesh."""
     derived: bool = False
     """Whether the parameter is computed from other, recovered parameters."""
 

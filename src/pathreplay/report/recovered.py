@@ -13,11 +13,10 @@ from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.pose import Pose
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem, variables_of
+from pathreplay.platform import compat
 from pathreplay.platform.files import file_names
 from pathreplay.report.outcome import Recovered, RecoveredPose
 from pathreplay.scenes.parameters import get_array
-
-VERTICES = ".vertex_positions"
 
 
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
@@ -39,11 +38,9 @@ def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
 def with_faces(problem: Problem, items: tuple[Recovered, ...]) -> tuple[Recovered, ...]:
     """Add the faces of the mesh to parameters that consist of mesh vertices."""
     params: Mapping[str, object] = (
-        mi.traverse(problem.scene) if any(item.key.endswith(VERTICES) for item in items) else {}
+        mi.traverse(problem.scene) if any(compat.is_positions(item.key) for item in items) else {}
     )
-    names = {item.key: item.key.removesuffix(VERTICES) + ".faces" for item in items if item.key.endswith(VERTICES)}
-    faces = {key: np.array(params[name]) for key, name in names.items() if name in params}
-    return tuple(replace(item, faces=faces.get(item.key)) for item in items)
+    return tuple(replace(item, faces=compat.faces_of_positions(params, item.key)) for item in items)
 
 
 def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:

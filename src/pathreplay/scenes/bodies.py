@@ -5,6 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.platform import compat
+
 _KNOBS = (  # direction, height and sharpness of each knob
     ((1.0, 0.1, 0.2), 0.55, 7.0),
     ((-0.5, 0.8, 0.3), 0.4, 9.0),
@@ -42,10 +44,5 @@ def knobs(directions: np.ndarray) -> np.ndarray:
 def mesh(vertices: np.ndarray, faces: np.ndarray, bsdf: dict[str, object], flat: bool = False) -> mi.Mesh:
     """Create a Mitsuba mesh, with vertex normals unless it is ``flat``."""
     props = mi.Properties()
-    props["bsdf"], props["face_normals"] = mi.load_dict(bsdf), flat
-    result = mi.Mesh("mesh", len(vertices), len(faces), props, has_vertex_normals=not flat)
-    params = mi.traverse(result)
-    params["vertex_positions"] = np.ravel(vertices).astype(np.float32)
-    params["faces"] = np.ravel(faces).astype(np.uint32)
-    params.update()
-    return result
+    props["bsdf"] = mi.load_dict(bsdf)
+    return compat.new_mesh(vertices, faces, props, flat)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.platform import compat
 from pathreplay.types import SceneDict
 
 
@@ -88,11 +89,7 @@ def slab(rows: int, columns: int, width: float, thickness: float, bsdf: dict[str
     vertices = np.concatenate(places)
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
-    corners = np.concatenate(faces)
-    result = mi.Mesh("slab", len(vertices), len(corners), props, has_vertex_normals=True, has_vertex_texcoords=True)
-    params = mi.traverse(result)
-    params["vertex_positions"], params["faces"] = np.float32(vertices).ravel(), np.uint32(corners).ravel()
-    params["vertex_texcoords"] = np.float32(vertices[:, :2] / [width, width * rows / columns] + 0.5).ravel()
-    params.update()
+    texcoords = vertices[:, :2] / [width, width * rows / columns] + 0.5
+    result = compat.new_mesh(vertices, np.concatenate(faces), props, flat=False, texcoords=texcoords)
     result.add_attribute("vertex_weight", 1, np.concatenate(weights).astype(np.float32))
     return result

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform import compat
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -121,8 +122,9 @@ def require_sound_serialized(path: Path, index: object) -> None:
         mesh = mi.load_dict(description)
     except RuntimeError:
         return
-    if mesh.vertex_count() and mesh.face_count():
-        _require_vertices(path, np.array(mi.traverse(mesh)["faces"]), mesh.vertex_count())
+    data = compat.mesh_arrays(mi.traverse(mesh))
+    if data is not None and mesh.vertex_count() and mesh.face_count():
+        _require_vertices(path, data.faces, mesh.vertex_count())
 
 
 def _require_vertices(path: Path, indices: np.ndarray, vertices: int) -> None:

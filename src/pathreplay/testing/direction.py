@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform import compat
 from pathreplay.scenes.parameters import SceneValue, displaced
 from pathreplay.scenes.spectra import coefficients, values_of_p
 from pathreplay.testing.stencil import BACKWARD, CENTRAL, FORWARD, Stencil
@@ -24,7 +25,7 @@ RELATIVE_STEP = 1e-2
 truncation (proportional to h²), and about 1e-5 from the float32 rounding of images."""
 
 # Parameters that may be negative. All other parameters without negative entries are treated as bounded by 0.
-_SIGNED = ("vertex_positions", "vertex_normals", "vertex_texcoords", "to_world", "to_uv", "position", "direction")
+_SIGNED = (*compat.POSITIONS, *compat.NORMALS, *compat.TEXCOORDS, "to_world", "to_uv", "position", "direction")
 
 
 @dataclass(frozen=True)

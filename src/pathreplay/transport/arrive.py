@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.emitters import emission, vertex_glow
 from pathreplay.transport.facts.traits import is_null
@@ -53,7 +54,7 @@ def choose(
     With media, the flight is sampled from ``sampler`` unless ``flight`` is given. The throughput ``β`` affects the
     probability that a collision is real (see `fly`).
     """
-    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+    si = at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
     if trace.steady_frames:
         si = steady(si, at.ray, active)
     if trace.media is None:
@@ -77,7 +78,7 @@ def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.B
         si = (
             met(at.hit, at.ray, active)
             if attached
-            else at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+            else at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
         )
     if kept.media is None:
         known = None if kept.known is None or attached else kept.known.glow

@@ -7,6 +7,7 @@ from collections.abc import Collection
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.platform import compat
 from pathreplay.platform.traversal import known_values
 from pathreplay.transport import scatter
 from pathreplay.transport.arrive import Vertex
@@ -76,7 +77,7 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
     if trace.attach == "none":
         return False
     with dr.resume_grad():
-        si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All)
+        si = at.hit.compute_surface_interaction(at.ray, compat.shading())
         moving: list[dr.ArrayBase] = [*start.repeat(), si.p, si.n, si.sh_frame.n]
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
@@ -98,7 +99,7 @@ def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
     Nothing is evaluated.
     """
     lobe, valid = at.hit.prim_index, at.hit.is_valid()  # values unknown at trace time
-    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, valid)
+    si = at.hit.compute_surface_interaction(at.ray, compat.shading(), valid)
     v = Vertex(si, si.bsdf(at.ray), valid, si, mi.Spectrum(0))
     kept = SampledContinuation(si.to_world(si.wi), mi.Float(1), lobe == 0, mi.Bool(False), lobe, valid)
     u = VertexSamples(mi.Point2f(0.5), mi.Float(0.5), mi.Point2f(0.5), mi.Float(0.5))

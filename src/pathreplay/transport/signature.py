@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.platform import compat
 from pathreplay.transport.facts.traits import FACETS, WHOLE, Tables
 from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import TraceConfig
@@ -42,7 +43,7 @@ def shape_met(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray
     """Return the shape that a ray hit. For a shape inside an instance, ``hit.shape`` is not this shape."""
     if not trace.traits.copies:
         return hit.shape
-    return hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & hit.is_valid()).shape
+    return hit.compute_surface_interaction(ray, compat.minimal(), active & hit.is_valid()).shape
 
 
 def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
@@ -67,7 +68,7 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
     silhouette on tubes, and the silhouette on other shapes.
     """
     with dr.suspend_grad():
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        si = hit.compute_surface_interaction(ray, compat.shading(), active)
         kind = si.shape.shape_type()  # not hit.shape, which may be an instance and then has no type
         on_mesh = active & si.shape.is_mesh()
         square, disk = kind == int(mi.ShapeType.Rectangle), kind == int(mi.ShapeType.Disk)
@@ -107,13 +108,7 @@ def outline_gap(
 
 
 def _nearest_side(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
-    corners = []
-    for uv in ((0, 0), (1, 0), (0, 1)):
-        corner = mi.PreliminaryIntersection3f(hit)
-        corner.prim_uv = mi.Point2f(*uv)
-        flags = mi.RayFlags.FollowShape | mi.RayFlags.Minimal
-        corners.append(corner.compute_surface_interaction(ray, flags, active).p)
-    a, b, c = corners
+    a, b, c = compat.triangle_corners(hit, ray, active)
     sides = (c - b, c - a, b - a)  # the sides opposite to a, b and c
     weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
     # Distances of the point from the sides, divided by twice the area of the triangle.

@@ -8,6 +8,7 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.meet import meet, short_of_end
 from pathreplay.transport.vertex import Arrival, TraceConfig
@@ -61,7 +62,7 @@ def behind_emitters(
 ) -> mi.PreliminaryIntersection3f:
     """Return the first hit that is not on an area emitter; distances are measured along ``ray``."""
     passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
-    si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed)
+    si = hit.compute_surface_interaction(ray, compat.minimal(), passed)
     onward = si.spawn_ray(ray.d)
     behind = short_of_end(trace, onward, trace.skip_area_emitters(trace.scene, onward, True, passed), passed)
     behind.t += dr.norm(onward.o - ray.o)

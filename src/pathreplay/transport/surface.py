@@ -8,6 +8,8 @@ from typing import TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.platform import compat
+
 T = TypeVar("T", bound="dr.ArrayBase")
 
 # A surface is treated as a sphere if dn = κ dp is satisfied up to this squared relative error.
@@ -26,7 +28,7 @@ def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi
     c < 2 `GRAZES`. This keeps the mean, because both bands contribute equally: for uniformly distributed rays, the
     density of c is proportional to c and cancels 1 / c. The remaining bias is of second order in `GRAZES`.
     """
-    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    si = hit.compute_surface_interaction(ray, compat.shading(), active)
     kind = si.shape.shape_type()
     rounded = (kind == int(mi.ShapeType.Sphere)) | (kind == int(mi.ShapeType.Cylinder))
     cos = dr.abs(dr.dot(dr.detach(si.n), dr.detach(ray.d)))
@@ -77,11 +79,9 @@ def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
     respect to texture coordinates are unsuitable: they vanish if the coordinates are degenerate, and depend on any
     motion of the coordinates.
     """
-    flags = mi.RayFlags.FollowShape
     on_mesh = active & hit.shape.is_mesh()
-    y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNGdUV | flags, active)
-    triangle = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal | flags, on_mesh)
-    A = dr.select(on_mesh, dr.cross(triangle.dp_du, triangle.dp_dv), dr.cross(y.dp_du, y.dp_dv))
+    y = hit.compute_surface_interaction(ray, compat.normal_partials() | compat.follow_shape(), active)
+    A = dr.select(on_mesh, dr.cross(*compat.triangle_sides(hit, ray, on_mesh)), dr.cross(y.dp_du, y.dp_dv))
     return SurfacePoint(y.p, A, dr.detach(y.n), dr.select(on_mesh, 0, _curvature(dr.detach(y))))
 
 

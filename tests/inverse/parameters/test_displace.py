@@ -351,7 +351,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "colours as weights": (of(coordinates="xy", weights="vertex_other"), "which has 147 numbers for 49 vertices"),
     "no mesh": (
         changed(key="Sheet.bsdf.reflectance.value"),
-        "'Sheet.bsdf.reflectance.value' is not the vertex_positions of a mesh; remove 'displace'",
+        "'Sheet.bsdf.reflectance.value' is not the vertex positions of a mesh; remove 'displace'",
     ),
     "both": (changed(function="own:f"), "has both 'function' and 'displace'; give one of them"),
     "neither": (changed(displace=None), "has neither 'function' nor 'displace'; give one of them"),

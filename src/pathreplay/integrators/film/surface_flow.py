@@ -35,6 +35,7 @@ from pathreplay.integrators.film.camera_flow import (
     probes_of,
     ray_derivatives,
 )
+from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.meet import meet
 from pathreplay.transport.motion import may_move
@@ -69,7 +70,7 @@ class SurfaceFlow:
         hit = meet(trace, ray, mi.Bool(True), coherent=True)
         visible, t = hit.is_valid(), dr.select(hit.is_valid(), hit.t, 1)
         with dr.resume_grad():
-            flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
+            flags = compat.minimal() | compat.follow_shape()
             si = hit.compute_surface_interaction(ray, flags, visible)
             if not dr.grad_enabled(si.p):
                 return None

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.parameter_options import Displace
+from pathreplay.platform import compat
 from pathreplay.scenes.parameters import get_array
-
-_VERTICES = "vertex_positions"
 
 
 @dataclass(frozen=True)
@@ -74,14 +73,13 @@ def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> 
     Raises:
         PathreplayError: the key is not the vertex positions of a mesh, or the mesh lacks coordinates or factors.
     """
-    owner, _, name = key.rpartition(".")
-    if name != _VERTICES or f"{owner}.faces" not in params:
-        raise PathreplayError(f"Parameter '{key}' is not the vertex_positions of a mesh; remove 'displace'")
+    owner, faces = key.rpartition(".")[0], compat.faces_of_positions(params, key)
+    if faces is None:
+        raise PathreplayError(f"Parameter '{key}' is not the vertex positions of a mesh; remove 'displace'")
     positions = get_array(params[key]).reshape(-1, 3)
     places, counts = np.unique(positions, axis=0, return_inverse=True, return_counts=True)[1:]
     places = places.ravel()
     if options.direction == "normal":
-        faces = np.array(params[f"{owner}.faces"]).reshape(-1, 3)
         direction = _normals(positions.astype(np.float64), places[faces], faces, len(counts))[places]
     else:
         vector = np.array(options.direction)
@@ -92,7 +90,7 @@ def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> 
             )
         direction = np.broadcast_to(vector / length, positions.shape)
     factors = _factors(params, key, owner, options.weights, len(positions))
-    u, v = _coordinates(params, key, owner, options.coordinates, positions)
+    u, v = _coordinates(params, key, options.coordinates, positions)
     return HeightMap(
         mi.Point2f(u, v),
         mi.Vector3f(*(direction * factors[:, None]).T.astype(np.float32)),
@@ -140,7 +138,7 @@ def _factors(params: mi.SceneParameters, key: str, owner: str, name: str | None,
         return np.ones(count)
     if f"{owner}.{name}" not in params:
         known = [other.rpartition(".")[2] for other in params.keys() if other.startswith(f"{owner}.vertex_")]
-        others = ", ".join(sorted({*known} - {_VERTICES, "vertex_normals", "vertex_texcoords"})) or "none"
+        others = ", ".join(sorted({*known}.difference(compat.POSITIONS, compat.NORMALS, compat.TEXCOORDS))) or "none"
         raise PathreplayError(
             f"Parameter '{key}': displace.weights is '{name}', but the mesh has no such attribute (it has: {others}); "
             "add it to the mesh file, or remove 'weights'"
@@ -159,20 +157,20 @@ def _factors(params: mi.SceneParameters, key: str, owner: str, name: str | None,
 
 
 def _coordinates(
-    params: mi.SceneParameters, key: str, owner: str, kind: str, positions: NDArray[np.floating]
+    params: mi.SceneParameters, key: str, kind: str, positions: NDArray[np.floating]
 ) -> NDArray[np.float32]:
     """Return (u, v) of all vertices as two rows.
 
     Raises PathreplayError if the mesh lacks texture coordinates, or has no extent along an axis of planar coordinates.
     """
     if kind == "uv":
-        known = get_array(params[f"{owner}.vertex_texcoords"])
+        known = compat.texcoords_of(params, key)
         if not known.size:
             raise PathreplayError(
                 f"Parameter '{key}': the mesh has no texture coordinates, which place the height map; set "
                 "displace.coordinates to two axes such as 'xy', or add texture coordinates"
             )
-        return np.ascontiguousarray(known.reshape(-1, 2).T)
+        return np.ascontiguousarray(known.T)
     axes = positions[:, ["xyz".index(axis) for axis in kind]]
     low, extent = axes.min(axis=0), np.ptp(axes, axis=0)
     if not extent.all():

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.parameter_options import PARTS, PoseKind
+from pathreplay.platform import compat
 from pathreplay.scenes.parameters import SceneValue, get_array, is_transform
 
 PART_NAMES = (":translation", ":rotation")
@@ -35,7 +36,7 @@ _SMALL = 1e-3
 
 @dataclass(frozen=True)
 class Pose:
-    """Rigid motion of one scene parameter: ``…to_world`` (a transform) or ``…vertex_positions`` (3 n floats)."""
+    """Rigid motion of one scene parameter: ``…to_world`` (a transform) or the vertices of a mesh (3 n floats)."""
 
     key: str
     kind: PoseKind
@@ -74,7 +75,7 @@ class Pose:
             # A single product with an affine matrix keeps the last row exact. Cameras need this, because they divide by
             # the homogeneous coordinate.
             return type(self.base)(type(self.base.matrix)(A @ mi.Matrix4f(self.base.matrix)))
-        return dr.ravel(R @ (dr.unravel(mi.Vector3f, self.base) - c) + shift)
+        return compat.positions_like(self.base, R @ (compat.points_of(self.base) - c) + shift)
 
     def error(self, value: NDArray[np.float32]) -> PoseError | None:
         """Compare ``value`` (from `get_array`) with the true pose. Returns None if the true pose is unknown."""
@@ -133,12 +134,12 @@ def make_pose(key: str, value: SceneValue, kind: PoseKind, pivot: list[float] | 
     array = get_array(value)
     if is_transform(value):
         origin = array[:3, 3]
-    elif key.rsplit(".", 1)[-1] == "vertex_positions":
+    elif compat.is_positions(key):
         origin = array.reshape(-1, 3).mean(axis=0)
     else:
         raise PathreplayError(
             f"Parameter '{key}' is a {type(value).__name__} and has no pose; remove 'pose', or name a 'to_world' or "
-            "'vertex_positions' parameter"
+            f"'{compat.positions_name()}' parameter"
         )
     x, y, z = (float(v) for v in (origin if pivot is None else pivot))
     # A copy, because `value` refers to the scene's value, which changes during the run.

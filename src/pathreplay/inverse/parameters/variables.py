@@ -25,6 +25,7 @@ from pathreplay.inverse.parameters.pyramid import Pyramid
 from pathreplay.inverse.parameters.regularizers import Laplacian, Own, Penalty, Prior, Term, TotalVariation
 from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
 from pathreplay.inverse.parameters.values import Array, make_heights, make_value, require_finite_array, seen
+from pathreplay.platform import compat
 from pathreplay.scenes import parameters
 from pathreplay.scenes.parameters import SceneValue
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
@@ -217,10 +218,10 @@ def _coordinates(
 
 def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.integer]:
     """Return the faces of the mesh whose vertex positions are ``key``. Raises PathreplayError for any other key."""
-    owner, _, name = key.rpartition(".")
-    if name != "vertex_positions" or (faces := f"{owner}.faces") not in params:
-        raise PathreplayError(f"Parameter '{key}' is not the vertex_positions of a mesh; remove '{option}'")
-    return np.array(params[faces])
+    if (faces := compat.faces_of_positions(params, key)) is None:
+        name = compat.positions_name()
+        raise PathreplayError(f"Parameter '{key}' is not the {name} of a mesh; remove '{option}'")
+    return faces
 
 
 def _penalty(

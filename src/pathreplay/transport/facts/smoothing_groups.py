@@ -12,19 +12,20 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from pathreplay.platform import compat
+
 WELD, ULPS = 1e-5, 4
 """Vertices coincide if their distance is at most WELD times the mesh's diagonal plus ULPS units in the last place."""
 
 
 def mesh_smoothing_groups(mesh: mi.Mesh) -> np.ndarray:
     """Return the `smoothing_groups` of a smooth mesh; zeros for a rectangle, whose vertices are not accessible."""
-    params = mi.traverse(mesh)
-    if "faces" not in params:
+    data = compat.mesh_arrays(mi.traverse(mesh))
+    if data is None:
         return np.zeros(mesh.face_count(), int)
-    faces, positions = (np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions"))
     # Seams of emitters are not edges, because emission is continuous across a seam. Boundary segments that detect such
     # seams would be wasted, and fewer segments would detect outlines.
-    return smoothing_groups(faces, positions, 0 if mesh.is_emitter() else WELD)
+    return smoothing_groups(data.faces, data.positions, 0 if mesh.is_emitter() else WELD)
 
 
 def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WELD) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of
 from pathreplay.transport.facts.seams import CHECKERBOARD
 from pathreplay.transport.facts.smoothing_groups import mesh_smoothing_groups
@@ -173,7 +174,7 @@ def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
     def begin(shape: mi.Shape) -> int:
         if not is_mesh(shape):
             return WHOLE
-        if shape.has_face_normals() or not shape.has_vertex_normals():
+        if shape.has_face_normals() or not compat.has_normals(shape):
             return FACETS
         groups = mesh_smoothing_groups(shape)
         if not groups.any():
@@ -190,15 +191,15 @@ def is_coarse(mesh: mi.Mesh) -> bool:
 
     Near the silhouette, such triangles occlude emitters that lie above the horizon of the shading normal.
     """
-    params = mi.traverse(mesh)
-    if mesh.has_face_normals() or not mesh.has_vertex_normals() or "faces" not in params:
+    if mesh.has_face_normals() or not compat.has_normals(mesh):
         return False
-    faces, at, normals = (
-        np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions", "vertex_normals")
-    )
-    a, b, c = (at[faces[:, i]].astype(np.float64) for i in range(3))
+    if (data := compat.mesh_arrays(mi.traverse(mesh))) is None:
+        return False
+    a, b, c = (data.positions[data.faces[:, i]].astype(np.float64) for i in range(3))
     n = np.cross(b - a, c - a)
-    cosines = np.einsum("fk,fik->fi", n, normals[faces]) / np.maximum(np.linalg.norm(n, axis=1), 1e-30)[:, None]
+    cosines = (
+        np.einsum("fk,fik->fi", n, data.normals[data.faces]) / np.maximum(np.linalg.norm(n, axis=1), 1e-30)[:, None]
+    )
     return bool(np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean() > COARSE)
 
 
@@ -222,10 +223,9 @@ def _mesh_emitters(shapes: list[mi.Shape]) -> list[mi.Mesh]:
 
 def _bounding_sphere(mesh: mi.Mesh) -> np.ndarray:
     """Return centre and radius of a bounding sphere; radius 0 for a rectangle, whose vertices are not accessible."""
-    params = mi.traverse(mesh)
-    if "vertex_positions" not in params:
+    if (data := compat.mesh_arrays(mi.traverse(mesh))) is None:
         return np.zeros(4)
-    positions = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
+    positions = data.positions.astype(np.float64)
     centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
     return np.array([*centre, np.linalg.norm(positions - centre, axis=1).max()])
 

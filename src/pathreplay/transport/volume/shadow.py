@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.meet import meet
 from pathreplay.transport.vertex import Shadow, TraceConfig
@@ -45,7 +46,7 @@ class Stretch:
     def beyond(self, hit: mi.PreliminaryIntersection3f, T: mi.Spectrum) -> tuple[Stretch, mi.Spectrum]:
         """Return the segment behind the surface at ``hit``, and ``T`` times the null transmission of the surface."""
         met, ray = self.active & hit.is_valid(), mi.Ray3f(self.ray)
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, met)
+        si = hit.compute_surface_interaction(ray, compat.shading(), met)
         T = dr.select(met, T * si.bsdf(ray).eval_null_transmission(si, met), T)
         medium = dr.select(met & si.is_medium_transition(), si.target_medium(ray.d), self.medium)
         onward = si.spawn_ray(ray.d)
@@ -155,5 +156,5 @@ def _boundary(trace: TraceConfig, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, s
     met = active & hit.is_valid()
     # The attached ray must start at y, too: on a sphere, Mitsuba computes the hit again, as the ray's first hit.
     probe.o, probe.d = ray.o + y * ray.d, sign * ray.d
-    si = hit.compute_surface_interaction(probe, mi.RayFlags.All, met)
+    si = hit.compute_surface_interaction(probe, compat.shading(), met)
     return dr.select(met, dr.replace_grad(y + sign * hit.t, y + sign * si.t), ray.maxt if sign > 0 else 0)

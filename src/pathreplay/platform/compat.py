@@ -1,0 +1,247 @@
+"""The two forms of Mitsuba's interface that differ between version 3.9 and its successor, behind one name each.
+
+Version 3.9 is supported. The forms of 3.10 are those of its development branch. Which form applies is decided by the
+names that Mitsuba has, not by its version.
+
+- Flags of `compute_surface_interaction`: 3.10 has ``Minimal``, ``Shading`` (alias ``Default``) and ``NormalPartials``
+  only, and tangents are not part of ``Minimal``.
+- Meshes: 3.9 has flat arrays such as ``vertex_positions``; 3.10 has tensors such as ``positions``, with one row per
+  point. In 3.10, vertices can refer to positions and normals through index maps, which are empty by default.
+- Silhouettes: 3.10 prepares them lazily, for meshes whose positions have gradients. No other module samples Mitsuba's
+  silhouettes, so this needs no second form.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from functools import cache
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+POSITIONS = "vertex_positions", "positions"
+"""Names of the parameter that consists of the positions of a mesh, in 3.9 and 3.10."""
+NORMALS = "vertex_normals", "normals"
+TEXCOORDS = "vertex_texcoords", "texcoords"
+_FACES = "faces"
+_SHADING = "Default"  # the flag of 3.10
+_FROM_FIELDS = "from_fields"  # the method of 3.10 that fills a mesh
+_PREFIXES = "vertex_", "face_"
+_OTHERS = _FACES, "bsdf_index", "position_index", "normal_index"
+
+
+class _Detail(NamedTuple):
+    """Values of flags."""
+
+    minimal: int
+    shading_frame: int
+    shading: int
+    normal_partials: int
+    follow_shape: int
+
+
+@cache
+def _detail(flags: type[enum.Enum]) -> _Detail:
+    """Return the values of the flags from the enumeration ``flags``."""
+    value = {name: int(flag.value) for name, flag in flags.__members__.items()}
+    minimal, follow = value["Minimal"], value["FollowShape"]
+    if _SHADING in value:
+        shading = value[_SHADING]
+        return _Detail(minimal, shading, shading, shading | value["NormalPartials"], follow)
+    every = value["All"]
+    return _Detail(minimal, minimal | value["ShadingFrame"], every, every | value["dNGdUV"], follow)
+
+
+def minimal() -> int:
+    """Flags of an interaction with distance, position and geometric normal."""
+    return _detail(mi.RayFlags).minimal
+
+
+def shading_frame() -> int:
+    """Flags of an interaction that also has a shading frame."""
+    return _detail(mi.RayFlags).shading_frame
+
+
+def shading() -> int:
+    """Flags of an interaction that also has texture coordinates, tangents and the incident direction."""
+    return _detail(mi.RayFlags).shading
+
+
+def normal_partials() -> int:
+    """Flags of an interaction that also has derivatives of the normal.
+
+    In 3.9, the derivatives are those of the geometric normal, in 3.10 those of the shading normal. On shapes other than
+    meshes, both are equal.
+    """
+    return _detail(mi.RayFlags).normal_partials
+
+
+def follow_shape() -> int:
+    """Flag of an interaction whose derivatives are those of a point with fixed surface coordinates."""
+    return _detail(mi.RayFlags).follow_shape
+
+
+def triangle_corners(
+    hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[mi.Point3f, mi.Point3f, mi.Point3f]:
+    """Return the corners of the triangle that was hit. They move with the mesh, and with its instance."""
+    points = []
+    for uv in ((0, 0), (1, 0), (0, 1)):
+        corner = mi.PreliminaryIntersection3f(hit)
+        corner.prim_uv = mi.Point2f(*uv)
+        points.append(corner.compute_surface_interaction(ray, minimal() | follow_shape(), active).p)
+    a, b, c = points
+    return a, b, c
+
+
+def triangle_sides(
+    hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Return two sides of the triangle that was hit, from its first corner. They move with the mesh."""
+    if _SHADING in mi.RayFlags.__members__:
+        a, b, c = triangle_corners(hit, ray, active)
+        return b - a, c - a
+    si = hit.compute_surface_interaction(ray, minimal() | follow_shape(), active)
+    return si.dp_du, si.dp_dv  # without texture coordinates, they are the sides
+
+
+class MeshArrays(NamedTuple):
+    """The data of a mesh with n vertices and m faces."""
+
+    faces: NDArray[np.integer]
+    """Vertex indices, (m, 3)."""
+    positions: NDArray[np.float32]
+    """Positions, (n, 3)."""
+    normals: NDArray[np.float32]
+    """Normals, (n, 3), or (0, 3) if the mesh has none."""
+    texcoords: NDArray[np.float32]
+    """Texture coordinates, (n, 2), or (0, 2) if the mesh has none."""
+
+
+def mesh_arrays(params: Mapping[str, object]) -> MeshArrays | None:
+    """Return the data of a mesh, or None if its positions are not accessible, as those of a rectangle.
+
+    Args:
+        params: ``mi.traverse(mesh)``.
+    """
+    if _FACES not in params:
+        return None
+    positions = _rows(params, POSITIONS, 3)
+    at = _index(params, "position_index", len(positions))
+    normals, texcoords = _rows(params, NORMALS, 3), _rows(params, TEXCOORDS, 2)
+    if len(normals):
+        # An empty map of normals is the map of positions, if there are as many normals as positions.
+        with_positions = len(normals) == len(positions)
+        normals = normals[_index(params, "normal_index", len(normals), at if with_positions else None)]
+    return MeshArrays(np.array(params[_FACES]).reshape(-1, 3), positions[at], normals, texcoords)
+
+
+def _rows(params: Mapping[str, object], names: tuple[str, str], width: int) -> NDArray[np.float32]:
+    for name in names:
+        if name in params:
+            return np.array(params[name], np.float32).reshape(-1, width)
+    return np.zeros((0, width), np.float32)
+
+
+def _index(
+    params: Mapping[str, object], name: str, count: int, otherwise: NDArray[np.integer] | None = None
+) -> NDArray[np.integer]:
+    """Return an index map. An empty or missing map is ``otherwise``, by default the identity."""
+    index = np.array(params[name]).ravel() if name in params else np.zeros(0, int)
+    if len(index):
+        return index
+    return np.arange(count) if otherwise is None else otherwise
+
+
+def positions_name() -> str:
+    """Return the name that the active version gives to the positions of a mesh."""
+    return POSITIONS[_has_mesh_tensors()]
+
+
+def _has_mesh_tensors() -> bool:
+    return hasattr(mi.Mesh, _FROM_FIELDS)
+
+
+def is_positions(key: str) -> bool:
+    """Return whether a key is the name of the positions of a mesh."""
+    return key.rpartition(".")[2] in POSITIONS
+
+
+def faces_of_positions(params: Mapping[str, object], key: str) -> NDArray[np.integer] | None:
+    """Return the faces (m, 3) of a mesh as indices into its positions; None if ``key`` is no positions of a mesh."""
+    owner, dot, _ = key.rpartition(".")
+    faces, index = f"{owner}{dot}{_FACES}", f"{owner}{dot}position_index"
+    if not is_positions(key) or faces not in params:
+        return None
+    corners = np.array(params[faces]).reshape(-1, 3)
+    at = np.array(params[index]).ravel() if index in params else np.zeros(0, int)
+    return at[corners] if len(at) else corners
+
+
+def texcoords_of(params: Mapping[str, object], key: str) -> NDArray[np.float32]:
+    """Return the texture coordinates (n, 2) of the mesh with the positions ``key``; (0, 2) if it has none."""
+    owner, dot, _ = key.rpartition(".")
+    first, second = (f"{owner}{dot}{name}" for name in TEXCOORDS)
+    return _rows(params, (first, second), 2)
+
+
+def points_of(positions: dr.ArrayBase) -> mi.Vector3f:
+    """Return positions of a mesh as points."""
+    return dr.unravel(mi.Vector3f, positions.array if dr.is_tensor_v(positions) else positions)
+
+
+def positions_like(positions: dr.ArrayBase, points: mi.Vector3f) -> dr.ArrayBase:
+    """Return points in the form of the positions of a mesh, which is that of ``positions``."""
+    flat: mi.Float = dr.ravel(points)
+    return mi.TensorXf(flat, shape=positions.shape) if dr.is_tensor_v(positions) else flat
+
+
+def is_mesh_data(name: str) -> bool:
+    """Return whether a parameter of a mesh, ``name``, is part of the mesh file."""
+    return name.startswith(_PREFIXES) or name in {*POSITIONS, *NORMALS, *TEXCOORDS, *_OTHERS}
+
+
+def has_normals(mesh: mi.Mesh) -> bool:
+    """Return whether a mesh has vertex normals."""
+    name = "has_normals" if hasattr(mesh, "has_normals") else "has_vertex_normals"
+    return bool(getattr(mesh, name)())
+
+
+def new_mesh(
+    vertices: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    props: mi.Properties,
+    flat: bool,
+    texcoords: NDArray[np.floating] | None = None,
+) -> mi.Mesh:
+    """Create a mesh.
+
+    Args:
+        vertices: positions, (n, 3).
+        faces: vertex indices, (m, 3).
+        props: properties of the mesh, such as its material.
+        flat: whether the mesh has no vertex normals.
+        texcoords: texture coordinates, (n, 2), or None.
+    """
+    props["face_normals"] = flat
+    points, corners = vertices.astype(np.float32), faces.astype(np.uint32)
+    if _has_mesh_tensors():
+        mesh = mi.Mesh(props)
+        more = {} if texcoords is None else {TEXCOORDS[1]: mi.TensorXf(texcoords.astype(np.float32))}
+        getattr(mesh, _FROM_FIELDS)(faces=mi.TensorXu(corners), positions=mi.TensorXf(points), **more)
+        return mesh
+    has_texcoords = texcoords is not None
+    mesh = mi.Mesh(
+        "mesh", len(vertices), len(faces), props, has_vertex_normals=not flat, has_vertex_texcoords=has_texcoords
+    )
+    params = mi.traverse(mesh)
+    if texcoords is not None:
+        params[TEXCOORDS[0]] = texcoords.astype(np.float32).ravel()
+    params[POSITIONS[0]] = points.ravel()
+    params[_FACES] = corners.ravel()
+    params.update()
+    return mesh
