@@ -24,6 +24,11 @@ def colours(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> 
     return np.random.default_rng(seed).uniform(low, high, (*shape, 3)).astype(np.float32)
 
 
+def painted(values: np.ndarray) -> dict:
+    """A texture of colours, in all variants."""
+    return {**bitmap(values), "raw": False, "wrap_mode": "repeat"}
+
+
 # ------------------------------ Emitters ------------------------------
 
 
@@ -57,7 +62,7 @@ def emitters() -> dict[str, Callable[[], dict]]:
     down = T().look_at([0.4, 2.6, -0.3], [0, 0.1, 0.3], [0, 0, 1])
     return {
         "area": panel,
-        "painted area": lambda: panel(bitmap(colours(4, 4, low=2, high=30))),
+        "painted area": lambda: panel(painted(colours(4, 4, low=2, high=30))),
         "sphere": lambda: {
             "type": "sphere", "center": [0.2, 2.2, 0.3], "radius": 0.3,
             "emitter": {"type": "area", "radiance": rgb(12, 10, 9)},
@@ -73,7 +78,7 @@ def emitters() -> dict[str, Callable[[], dict]]:
         },
         "envmap": map_of_sky,
         "constant": lambda: {"type": "constant", "radiance": rgb(0.8, 0.6, 0.5)},
-        "projector": lambda: {"type": "projector", "to_world": down, "fov": 50, "irradiance": bitmap(colours(4, 4))},
+        "projector": lambda: {"type": "projector", "to_world": down, "fov": 50, "irradiance": painted(colours(4, 4))},
     }  # fmt: skip
 
 
@@ -284,11 +289,11 @@ def dome(light: str = "point", eye: str = "perspective", bsdf: dict | None = Non
         },
         "painted area": lambda: {
             "type": "rectangle", "to_world": down @ T().translate([0, 0, -0.9]) @ T().scale(0.3),
-            "emitter": {"type": "area", "radiance": bitmap(colours(4, 4, low=2, high=30))},
+            "emitter": {"type": "area", "radiance": painted(colours(4, 4, low=2, high=30))},
         },
-        "projector": lambda: {"type": "projector", "to_world": down, "fov": 50, "irradiance": bitmap(colours(4, 4))},
+        "projector": lambda: {"type": "projector", "to_world": down, "fov": 50, "irradiance": painted(colours(4, 4))},
     }  # fmt: skip
-    paint = {"type": "diffuse", "reflectance": {**bitmap(colours(8, 8, seed=4)), "wrap_mode": "repeat"}}
+    paint = {"type": "diffuse", "reflectance": painted(colours(8, 8, seed=4, low=0.05, high=0.9))}
     skin = {
         "type": "sphere", "to_world": T().scale(1.6), "flip_normals": True,
         "bsdf": bsdf or {"type": "twosided", "bsdf": paint},
@@ -297,6 +302,22 @@ def dome(light: str = "point", eye: str = "perspective", bsdf: dict | None = Non
     if eye == "meter":
         return {**parts, "dome": meter(skin)}
     return {**parts, "sensor": sensor(eye, rfilter, look, **({"focus_distance": 1.4} if eye == "thinlens" else {}))}
+
+
+def plane(light: str, **more: Any) -> dict:
+    """A textured floor, whose outline is out of view, under a light."""
+    T = mi.ScalarTransform4f
+    return {
+        "type": "scene",
+        "sensor": sensor(look=T().look_at([0, 3, -1], [0, 0, 0.3], [0, 1, 0])),
+        "light": emitters()[light](),
+        "floor": {
+            "type": "rectangle",
+            "to_world": T().rotate([1, 0, 0], -90) @ T().scale(8),
+            "bsdf": {"type": "diffuse", "reflectance": painted(colours(8, 8, seed=4, low=0.05, high=0.9))},
+        },
+        **more,
+    }
 
 
 ROUGH: dict = {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.35, "material": "Al"}}
@@ -316,6 +337,22 @@ def wavy(n: int = 17) -> mi.Mesh:
     params["faces"] = faces.ravel().astype(np.uint32)
     params.update()
     return mesh
+
+
+def mirror() -> dict:
+    """A wavy mirror that throws the light of a spot at a ceiling. The light meets no outline of it."""
+    T = mi.ScalarTransform4f
+    down = T().look_at([0.1, 0, 2], [0, 0, 0], [0, 1, 0])
+    return {
+        "type": "scene",
+        "sensor": sensor(look=T().look_at([1.6, 0, 1.2], [0, 0, 2.6], [0, 0, 1])),
+        "light": {"type": "spot", "to_world": down, "cutoff_angle": 18.0, "intensity": rgb(60, 50, 40)},
+        "mirror": {"type": "ply", "filename": written(wavy()), "bsdf": {"type": "conductor"}},
+        "ceiling": {
+            "type": "rectangle", "to_world": T().translate([0, 0, 2.6]) @ T().rotate([1, 0, 0], 180) @ T().scale(4),
+            "bsdf": {"type": "diffuse", "reflectance": rgb(0.8, 0.7, 0.6)},
+        },
+    }  # fmt: skip
 
 
 def slab(light: str = "spot", eye: str = "perspective", bsdf: dict | None = None) -> dict:
