@@ -24,6 +24,12 @@ def colours(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> 
     return np.random.default_rng(seed).uniform(low, high, (*shape, 3)).astype(np.float32)
 
 
+def smooth_colours(n: int = 64) -> np.ndarray:
+    """Colours without visible kinks, each of another phase."""
+    x, y = np.meshgrid(*[np.arange(n) / n * 2 * np.pi] * 2)
+    return np.stack([0.5 + 0.4 * np.sin(2 * x + k) * np.cos(y - k) for k in range(3)], -1).astype(np.float32)
+
+
 def painted(values: np.ndarray) -> dict:
     """A texture of colours, in all variants."""
     return {**bitmap(values), "raw": False, "wrap_mode": "repeat"}
@@ -291,9 +297,11 @@ def dome(light: str = "point", eye: str = "perspective", bsdf: dict | None = Non
             "type": "rectangle", "to_world": down @ T().translate([0, 0, -0.9]) @ T().scale(0.3),
             "emitter": {"type": "area", "radiance": painted(colours(4, 4, low=2, high=30))},
         },
-        "projector": lambda: {"type": "projector", "to_world": down, "fov": 50, "irradiance": painted(colours(4, 4))},
+        "projector": lambda: {
+            "type": "projector", "to_world": down, "fov": 50, "irradiance": painted(smooth_colours()),
+        },
     }  # fmt: skip
-    paint = {"type": "diffuse", "reflectance": painted(colours(8, 8, seed=4, low=0.05, high=0.9))}
+    paint = {"type": "diffuse", "reflectance": painted(smooth_colours())}
     skin = {
         "type": "sphere", "to_world": T().scale(1.6), "flip_normals": True,
         "bsdf": bsdf or {"type": "twosided", "bsdf": paint},
@@ -304,17 +312,25 @@ def dome(light: str = "point", eye: str = "perspective", bsdf: dict | None = Non
     return {**parts, "sensor": sensor(eye, rfilter, look, **({"focus_distance": 1.4} if eye == "thinlens" else {}))}
 
 
-def plane(light: str, **more: Any) -> dict:
-    """A textured floor, whose outline is out of view, under a light."""
+def plane(light: str, eye: str = "perspective", **more: Any) -> dict:
+    """A textured floor, whose outline is out of view, under a light. A `meter` above the light looks down."""
     T = mi.ScalarTransform4f
+    beam = {
+        "type": "rectangle", "to_world": T().look_at([0.3, 5, 0.4], [0, 0, 0.2], [0, 0, 1]) @ T().scale(0.7),
+        "emitter": {"type": "directionalarea", "radiance": rgb(3, 2.5, 2)},
+    }  # fmt: skip
+    down = T().translate([0.2, 3.5, 0.3]) @ T().rotate([1, 0, 0], 80) @ T().scale(0.4)
+    own = {"sensor": sensor(look=T().look_at([0, 3, -1], [0, 0, 0.3], [0, 1, 0]))}
+    if eye == "meter":
+        own = {"probe": meter({"type": "rectangle", "to_world": down})}
     return {
         "type": "scene",
-        "sensor": sensor(look=T().look_at([0, 3, -1], [0, 0, 0.3], [0, 1, 0])),
-        "light": emitters()[light](),
+        **own,
+        "light": beam if light == "directionalarea" else emitters()[light](),
         "floor": {
             "type": "rectangle",
             "to_world": T().rotate([1, 0, 0], -90) @ T().scale(8),
-            "bsdf": {"type": "diffuse", "reflectance": painted(colours(8, 8, seed=4, low=0.05, high=0.9))},
+            "bsdf": {"type": "diffuse", "reflectance": painted(smooth_colours())},
         },
         **more,
     }
@@ -355,10 +371,17 @@ def mirror() -> dict:
     }  # fmt: skip
 
 
-def slab(light: str = "spot", eye: str = "perspective", bsdf: dict | None = None) -> dict:
-    """A slab of glass with a wavy top, which casts a caustic on a floor. The light meets no outline of it."""
+def slab(light: str = "spot", eye: str = "perspective", both: bool = False) -> dict:
+    """A slab of glass with a wavy top, which casts a caustic on a floor. The light meets no outline of it.
+
+    With ``both``, the bottom is wavy, too.
+    """
     T = mi.ScalarTransform4f
-    glass = bsdf or {"type": "dielectric_ad", "int_ior": 1.5, "ext_ior": 1.0}
+    glass = {"type": "dielectric_ad", "int_ior": 1.5, "ext_ior": 1.0}
+    bottom = {"type": "rectangle", "to_world": T().translate([0, 0, -0.2]) @ T().rotate([1, 0, 0], 180)}
+    if both:
+        turned = T().translate([0, 0, -0.5]) @ T().rotate([0, 0, 1], 30)
+        bottom = {"type": "ply", "filename": written(wavy()), "to_world": turned, "flip_normals": True}
     look = T().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
     lights = {
         "spot": {"type": "spot", "to_world": look, "cutoff_angle": 12.0, "intensity": rgb(60, 50, 40)},
@@ -372,9 +395,7 @@ def slab(light: str = "spot", eye: str = "perspective", bsdf: dict | None = None
         "sensor": sensor(eye, look=T().look_at([2.4, 0, -0.8], [0, 0, -2], [0, 0, 1])),
         "light": lights[light],
         "top": {"type": "ply", "filename": written(wavy()), "bsdf": glass},
-        "bottom": {
-            "type": "rectangle", "to_world": T().translate([0, 0, -0.2]) @ T().rotate([1, 0, 0], 180), "bsdf": dict(glass),
-        },
+        "bottom": {**bottom, "bsdf": dict(glass)},
         "floor": {
             "type": "rectangle", "to_world": T().translate([0, 0, -2]) @ T().scale(4),
             "bsdf": {"type": "diffuse", "reflectance": rgb(0.8, 0.7, 0.6)},
