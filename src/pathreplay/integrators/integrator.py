@@ -117,6 +117,7 @@ class PathReplayIntegrator(PathIntegrator):
     """
 
     name = "pathreplay"
+    without_light_paths = "take caustics = 'camera'"  # remedy where light paths are not supported
     interior: PathReplay
 
     def __init__(self, props: mi.Properties) -> None:
@@ -240,7 +241,7 @@ class PathReplayIntegrator(PathIntegrator):
         if facts_of(scene).has_media:
             return "the scene has media; leave them out"
         if self.particles is not None:
-            return "caustics = 'particles' adds light from other pixels; take 'camera'"
+            return f"light paths contribute to other pixels; {self.without_light_paths}"
         return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._flow_obstacle(view))
 
     def _flow_obstacle(self, view: Pass) -> str:
@@ -400,7 +401,13 @@ class PathReplayIntegrator(PathIntegrator):
             "sampling": SAMPLING[self.uses_sobol],
             "boundary": self.boundary,
             "boundary_spp": self.boundary_spp,
+            "caustics": self.caustics,
         }
+
+    @property
+    def caustics(self) -> str:
+        """The value of the property ``caustics``; "particles" if all light is traced from the emitters."""
+        return CAUSTICS[self.particles is not None]
 
     def to_string(self) -> str:
         return self._described(
@@ -410,4 +417,5 @@ class PathReplayIntegrator(PathIntegrator):
             null_branching=self.null_branching,
             sampling=SAMPLING[self.uses_sobol],
             boundary=self.boundary,
+            caustics=self.caustics,
         )

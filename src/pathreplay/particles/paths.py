@@ -121,7 +121,7 @@ def particle_tangent(
             wavelengths = path.at.ray.wavelengths
             c = colour(β * splat.c, wavelengths)
             film.add(sums, splat.at, splat.at.x, splat.at.y, colour(δβ * splat.c + β * splat.δc, wavelengths), lit)
-            if dr.hint(moves, mode="scalar"):
+            if dr.hint(moves and not film.meter, mode="scalar"):
                 film.add(sums, splat.at, splat.δx, splat.at.y, c, lit)
                 film.add(sums, splat.at, splat.at.x, splat.δy, c, lit)
             δβ = (δβ * dr.detach(again.w) + β * δw) * v.rr_weight

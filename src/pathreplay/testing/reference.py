@@ -56,7 +56,7 @@ def integrator_under_test(
         limits = None if own is None else read_limits(own)
         description = {"type": spec or "pathreplay", **({} if limits is None else vars(limits))}
         options = {} if own is None or description["type"] != "pathreplay" else stateful(own).options()
-        description |= {name: options[name] for name in ("boundary", "boundary_spp") if name in options}
+        description |= {name: options[name] for name in ("boundary", "boundary_spp", "caustics") if name in options}
     if max_depth is not None:
         description["max_depth"] = max_depth
     if boundary and description.get("type") != "pathreplay":

@@ -14,28 +14,29 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.transport.arrive import Vertex
 
-def smooth_adjoint(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
+
+def smooth_adjoint(v: Vertex, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
     """Return the weight, times density, of scattering into the local direction ``wo`` by smooth lobes (Spectrum)."""
-    turned = mi.SurfaceInteraction3f(si)
+    turned = mi.SurfaceInteraction3f(v.si)
     turned.wi = wo
-    return bsdf.eval(mi.BSDFContext(), turned, si.wi, active) * _tilt(si, wo)
+    return v.bsdf.eval(mi.BSDFContext(), turned, v.si.wi, active) * _tilt(v, wo)
 
 
-def delta_adjoint(si: mi.SurfaceInteraction3f, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
+def delta_adjoint(v: Vertex, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
     """Return the factor of the weight of a delta lobe, which is sampled in importance mode.
 
     The normal at which the light is reflected or refracted is parallel to h = ω_l + η ω_c, with η the relative index of
     refraction across the lobe. Refraction changes solid angles by the ratio of the cosines with h.
     """
-    cos = dr.dot(si.wi, wo)
+    cos = dr.dot(v.si.wi, wo)
     a, b = 1 + eta * cos, cos + eta  # h·ω_l and h·ω_c
     regular = (a != 0) & (b != 0)
-    return dr.select(regular, dr.abs(a) * dr.rcp(dr.abs(dr.select(regular, b, 1))), 1) * _tilt(si, wo)
+    return dr.select(regular, dr.abs(a) * dr.rcp(dr.abs(dr.select(regular, b, 1))), 1) * _tilt(v, wo)
 
 
-def _tilt(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Float:
-    n = si.to_local(si.n)
-    before = dr.abs(dr.dot(n, si.wi))
+def _tilt(v: Vertex, wo: mi.Vector3f) -> mi.Float:
+    before = dr.abs(dr.dot(v.n, v.si.wi))
     lit = before > 0
-    return dr.select(lit, dr.abs(dr.dot(n, wo)) * dr.rcp(dr.select(lit, before, 1)), 0)
+    return dr.select(lit, dr.abs(dr.dot(v.n, wo)) * dr.rcp(dr.select(lit, before, 1)), 0)

@@ -12,6 +12,7 @@ import mitsuba as mi
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport import arrive, scatter
 from pathreplay.transport.sensor import SensorLink, Sighting
+from pathreplay.transport.surface import normal_in_frame
 from pathreplay.transport.vertex import (
     Arrival,
     SampledStep,
@@ -35,6 +36,7 @@ def choose_step(
     """
     link, ctx = _link(trace), mi.BSDFContext(mi.TransportMode.Importance)
     v = arrive.choose(trace, at, sampler, mi.Spectrum(1), active)
+    v.n = v.si.to_local(v.si.n)
     to = _sight(link, v, u, active)
     lit = active & v.surface & is_smooth(v.bsdf) & to.valid
     if link.caustics:
@@ -62,6 +64,7 @@ def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active:
     v = arrive.repeat(trace, again, attached, active)
     with dr.suspend_grad(when=not attached):
         to = _sight(link, v, again.u, lit)
+        v.n = normal_in_frame(again.at.hit, again.at.ray, v.si, active)
     f, _ = scatter.towards(v, ctx, to.d, lit)
     splat = Splat(dr.select(lit, f * to.W, 0), to.s)
     w, d, pdf = scatter.repeat(trace, v, again, ctx, attached)

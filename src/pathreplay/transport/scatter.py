@@ -70,7 +70,7 @@ def choose(
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
     f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(ctx, v.si, v.si.to_local(d), u.lobe, u.direction, at_surface)
     if ctx.mode == mi.TransportMode.Importance:
-        f = smooth_adjoint(v.bsdf, v.si, v.si.to_local(d), at_surface)
+        f = smooth_adjoint(v, v.si.to_local(d), at_surface)
         w = _adjoint_weight(v, sample, w, at_surface)
     delta, null = (mi.has_flag(sample.sampled_type, kind) for kind in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
     kept = SampledContinuation(
@@ -104,9 +104,9 @@ def _in_medium(
 def _adjoint_weight(v: Vertex, sample: mi.BSDFSample3f, w: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
     """Return the weight of a BSDF sample on a light path; ``w`` is the weight that Mitsuba returns."""
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    f = smooth_adjoint(v.bsdf, v.si, sample.wo, active & ~delta)
+    f = smooth_adjoint(v, sample.wo, active & ~delta)
     smooth = dr.select(dr.any(dr.detach(w) != 0), f * reciprocal(sample.pdf), 0)
-    return dr.select(delta, w * delta_adjoint(v.si, sample.wo, sample.eta), smooth)
+    return dr.select(delta, w * delta_adjoint(v, sample.wo, sample.eta), smooth)
 
 
 def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
@@ -114,7 +114,7 @@ def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> 
     surface = active if v.inside is None else active & v.surface
     f, pdf = v.bsdf.eval_pdf(ctx, v.si, v.si.to_local(d), surface)
     if ctx.mode == mi.TransportMode.Importance:
-        f = smooth_adjoint(v.bsdf, v.si, v.si.to_local(d), surface)
+        f = smooth_adjoint(v, v.si.to_local(d), surface)
     if v.inside is None:
         return f, pdf
     event = v.inside.event
@@ -166,7 +166,7 @@ def _at_surface(
     else:
         f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
     if ctx.mode == mi.TransportMode.Importance:
-        f = smooth_adjoint(bsdf, si, wo, smooth)
+        f = smooth_adjoint(v, wo, smooth)
     w = f * J * dr.detach(reciprocal(kept.pdf))
     # A failed sample has weight zero even if f is not zero (`roughdielectric` may reflect to the far side). The weight
     # of a black BSDF is also zero, but here f is zero, and the derivative of the weight is kept.
@@ -247,7 +247,7 @@ def _delta_weight(
         sample, w_k = v.bsdf.sample(alone, v.si, u.lobe, u.direction, picked)
         w_k *= dr.detach(reciprocal(kept.pdf))
         if ctx.mode == mi.TransportMode.Importance:
-            w_k *= delta_adjoint(v.si, sample.wo, sample.eta)
+            w_k *= delta_adjoint(v, sample.wo, sample.eta)
         same = picked & (dr.squared_norm(dr.detach(sample.wo) - v.si.to_local(kept.d)) < SAME_LOBE)
         same &= dr.all(dr.abs(dr.detach(w_k) - drawn) <= SAME_LOBE * dr.abs(drawn))
         w = dr.select(same, w_k, w)

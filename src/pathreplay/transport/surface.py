@@ -62,6 +62,23 @@ def steady(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Su
     return dr.select(active & si.is_valid() & si.shape.is_mesh(), turned, si)
 
 
+def normal_in_frame(
+    hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, active: mi.Bool
+) -> mi.Vector3f:
+    """Return the geometric normal in the shading frame of ``si``, differentiable in the shape only.
+
+    The position on the shape is constant. On a mesh with interpolated normals, the normal in the shading frame drifts
+    as the position moves within a triangle, and jumps back at the edge to the next one. The mean derivative of both is
+    nearly zero, but only the drift could be differentiated.
+    """
+    n = dr.detach(si.to_local(si.n))
+    y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    if not dr.grad_enabled(y.n, y.sh_frame.n):
+        return n
+    turned = dr.detach(si).to_local(dr.detach(y).to_world(y.to_local(y.n)))
+    return dr.replace_grad(n, dr.select(active, turned, n))
+
+
 @dataclass
 class SurfacePoint:
     """A point with fixed surface coordinates, which moves with its surface."""

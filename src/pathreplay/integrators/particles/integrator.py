@@ -58,6 +58,7 @@ class ParticleIntegrator(PathReplayIntegrator):
     """
 
     name = "pathreplay_particles"
+    without_light_paths = "take the integrator 'pathreplay'"
     particles: ParticleTerm
 
     def __init__(self, props: mi.Properties) -> None:

@@ -1,0 +1,277 @@
+"""Gradients of light paths against finite differences, with equal random numbers and in expectation.
+
+Nothing that moves in these scenes has an outline or a crease in the light, so that the derivative at fixed visibility
+is the whole derivative. With equal random numbers, the gradient of every image equals a central difference, where no
+random choice depends on the parameter. Run with -s to see the figures as tables.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from particle_scenes import ROUGH, dome, mirror, plane, slab
+from pathreplay.testing.objective import Move, Objective, smooth_weights
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.stencil import CENTRAL
+from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
+from places import ROOT, SUPPORT
+from truth import TRANSPOSE_MAX, add, random, rotate, translate
+
+PLUGIN = "pathreplay_particles"
+SAME_SEED_MAX = 1e-3
+"""Largest error of a gradient relative to the central difference with equal random numbers."""
+
+
+def waves(value: Any, t: Any) -> Any:
+    """Heights of a surface along z, which change its normals, too."""
+    points = np.array(value).reshape(-1, 3)
+    direction = np.zeros_like(points)
+    direction[:, 2] = 0.1 * np.cos(2 * points[:, 0] + points[:, 1])
+    return value + t * mi.Float(direction.ravel())
+
+
+def scale(value: Any, t: Any) -> Any:
+    """A multiple of the value, which leaves the distribution of random places on it unchanged."""
+    return value * (1 + t)
+
+
+def both_ways(first: Move, second: Move) -> Move:
+    """One move after the other."""
+    return lambda value, t: second(first(value, t), t)
+
+
+POSE = both_ways(translate(0.3, 0.5, 0.7), rotate(0.2, 0.4, 0.1))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A parameter of a scene, and how it moves."""
+
+    name: str
+    scene: Callable[[], dict]
+    key: str
+    move: Move
+    step: float = 2e-3  # of the central difference
+    depth: int = 3
+    spp: int = 512
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def cell(name: str, scene: Callable[[], dict], key: str, move: Move, **more: Any) -> Cell:
+    return Cell(name, scene, key, move, **more)
+
+
+SLOW, SLAB = {"step": 1e-3}, {"depth": 4, "step": 1e-3}
+ONCE = {"depth": 2, "step": 1e-3}
+"""Of what moves a vertex from which a smooth lobe continues: random directions there are fixed differently."""
+CELLS = (
+    cell("heights, mirror", mirror, "mirror.vertex_positions", waves, step=3e-3),
+    cell("heights, slab", slab, "top.vertex_positions", waves, spp=2048, **SLAB),
+    cell("receiver, mirror", mirror, "ceiling.to_world", POSE, **SLOW),
+    cell("receiver, slab", slab, "floor.to_world", POSE, **SLAB),
+    cell("camera, slab", slab, "sensor.to_world", POSE, **SLAB),
+    cell("receiver", dome, "dome.to_world", POSE, **ONCE),
+    cell("receiver, rough", partial(dome, bsdf=ROUGH), "dome.to_world", translate(0.3, 0.5, 0.7), **ONCE),
+    cell("perspective", dome, "sensor.to_world", POSE, **SLOW),
+    cell("thin lens", partial(dome, eye="thinlens"), "sensor.to_world", POSE, **SLOW),
+    cell("orthographic", partial(dome, eye="orthographic"), "sensor.to_world", POSE, **SLOW),
+    cell("meter", partial(plane, "spot", "meter"), "probe.to_world", POSE, spp=2**17, step=1e-2, depth=2),
+    cell("x_fov", dome, "sensor.x_fov", add(), step=0.1),
+    cell("x_fov, cropped", partial(dome, eye="cropped"), "sensor.x_fov", add(), step=0.1),
+    cell("x_fov, thin lens", partial(dome, eye="thinlens"), "sensor.x_fov", add(), step=0.1),
+    cell("principal point", partial(dome, eye="cropped"), "sensor.principal_point_offset_x", add(), **SLOW),
+    cell("focus_distance", partial(dome, eye="thinlens"), "sensor.focus_distance", add(), step=1e-2),
+    cell("aperture_radius", partial(dome, eye="thinlens"), "sensor.aperture_radius", add(), **SLOW),
+    cell("point", dome, "light.position", add([0.3, 0.5, 0.7]), depth=2, step=3e-4),
+    cell("point, rough", partial(dome, bsdf=ROUGH), "light.position", add([0.3, 0.5, 0.7]), **ONCE),
+    cell("spot", partial(dome, "spot"), "light.to_world", POSE, depth=2, step=3e-4),
+    cell("area", partial(dome, "area"), "light.to_world", POSE, **ONCE),
+    cell("projector", partial(dome, "projector"), "light.to_world", translate(0.3, 0.5, 0.7), **ONCE),
+    cell("directional", partial(plane, "directional"), "light.to_world", rotate(0.3, 0.5, 0.7), **ONCE),
+    cell("beam", partial(plane, "directionalarea"), "light.to_world", POSE, **ONCE),
+    cell("intensity", dome, "light.intensity.value", add([0.5, 1.0, 0.2]), step=0.1),
+    cell("radiance", partial(dome, "area"), "light.emitter.radiance.value", add([0.5, 1.0, 0.2]), step=0.1, depth=2),
+    cell("painted radiance", partial(dome, "painted area"), "light.emitter.radiance.data", scale, step=0.1, depth=2),
+    cell("reflectance", dome, "dome.bsdf.brdf_0.reflectance.data", random(0.5), step=1e-2),
+)
+BY_NAME = {c.name: c for c in CELLS}
+QUICK = ("heights, mirror", "thin lens", "receiver")
+
+
+@contextmanager
+def opened(cell: Cell) -> Iterator[Objective]:
+    """The objective of a cell, a weighted mean of the image. It is detached at the end."""
+    gc.collect()
+    scene = mi.load_dict(cell.scene(), optimize=False)
+    params = mi.traverse(scene)
+    objective = Objective(scene, params, cell.key, cell.move)
+    width, height = scene.sensors()[0].film().crop_size()
+    channels = 1 if mi.is_monochromatic else 3
+    objective.weigh(smooth_weights((int(height), int(width), channels), alpha=False))
+    try:
+        yield objective
+    finally:
+        params[cell.key] = objective.value
+        params.update()
+
+
+def integrator(cell: Cell, plugin: str = PLUGIN, **options: Any) -> mi.Integrator:
+    own = {"boundary": "none"} if plugin.startswith("pathreplay") else {}
+    return mi.load_dict({"type": plugin, "max_depth": cell.depth, **own, **cell.options, **options})
+
+
+# ------------------------------ Equal random numbers ------------------------------
+
+
+def same_seed(cell: Cell, spp: int) -> tuple[float, float]:
+    """Return the errors of a gradient against the central difference, and of forward against reverse mode.
+
+    Both are relative to the sum of the magnitudes that the pixels contribute.
+    """
+    with opened(cell) as objective:
+        steady = integrator(cell, rr_depth=1000)  # probabilities of survival would move
+        difference = objective.difference(steady, CENTRAL, cell.step, 1, spp)
+        gradient = objective.backward(steady, 1, spp)
+        transpose = objective.transpose_error(steady, steady, 1, spp)
+    size = objective.dot(np.abs(difference))
+    error = abs(gradient - objective.dot(difference)) / size
+    print(f"{cell.name:20s} depth {cell.depth:2d} {gradient:+12.5e} of {size:11.5e} {error:9.1e} {transpose:9.1e}")
+    return error, transpose
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_gradients_are_differences_with_equal_numbers(name: str) -> None:
+    error, transpose = same_seed(BY_NAME[name], 64)
+    assert error < SAME_SEED_MAX and transpose < TRANSPOSE_MAX
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", CELLS, ids=lambda c: c.name)
+def test_all_gradients_are_differences_with_equal_numbers(cell: Cell) -> None:
+    error, transpose = same_seed(cell, cell.spp)
+    assert error < SAME_SEED_MAX and transpose < TRANSPOSE_MAX
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rr_depth", [1, 2])
+def test_reverse_is_the_transpose_of_forward_under_roulette(rr_depth: int) -> None:
+    for name in ("receiver, rough", "reflectance", "spot"):
+        cell = BY_NAME[name]
+        with opened(cell) as objective:
+            same = integrator(cell, rr_depth=rr_depth)
+            assert objective.transpose_error(same, same, 1, 64) < TRANSPOSE_MAX
+
+
+# ------------------------------ In expectation ------------------------------
+
+
+SEEDS = 12
+ALPHA = "dome.bsdf.brdf_0.alpha.value"
+OWN = {"reference": PLUGIN}
+"""Differences of our own images, where `path` finds no light."""
+
+
+@dataclass(frozen=True)
+class Mean(Cell):
+    """A cell whose random choices may depend on the parameter."""
+
+    reference: str = "path"
+    rr_depth: int = 5
+
+
+def mean(name: str, scene: Callable[[], dict], key: str, move: Move, **more: Any) -> Mean:
+    return Mean(name, scene, key, move, **{"step": 1e-2, "spp": 256, **more})
+
+
+MEANS = (
+    mean("heights, slab", slab, "top.vertex_positions", waves, depth=6, **OWN),
+    mean("heights, slab, beam", partial(slab, "beam"), "top.vertex_positions", waves, depth=6, **OWN),
+    mean("heights, lens", partial(slab, both=True), "bottom.vertex_positions", waves, depth=6, **OWN),
+    mean("heights, lens, beam", partial(slab, "beam", both=True), "top.vertex_positions", waves, depth=6, **OWN),
+    mean("index, slab", slab, "top.bsdf.eta", add(), step=2e-2, depth=6, **OWN),
+    mean("spot, lens", partial(slab, both=True), "light.to_world", translate(0.3, 0, 0.1), depth=6, **OWN),
+    mean("spot, mirror", mirror, "light.to_world", translate(0.3, 0, 0.1), depth=4, **OWN),
+    mean("receiver, slab", slab, "floor.to_world", POSE, depth=6, **OWN),
+    mean("receiver", dome, "dome.to_world", POSE, depth=4),
+    mean("thin lens", partial(dome, eye="thinlens"), "sensor.to_world", POSE, depth=4),
+    mean("point", dome, "light.position", add([0.3, 0.5, 0.7]), depth=4),
+    mean("point, rough", partial(dome, bsdf=ROUGH), "light.position", add([0.3, 0.5, 0.7]), depth=4),
+    mean("spot", partial(dome, "spot"), "light.to_world", POSE, depth=4),
+    mean("roughness", partial(dome, bsdf=ROUGH), ALPHA, add(), depth=4),
+    mean("area", partial(dome, "area"), "light.to_world", POSE, depth=2),
+    mean("sky", partial(plane, "envmap"), "light.to_world", rotate(0.3, 0.5, 0.7), depth=2, spp=2048),
+    mean("painted radiance", partial(dome, "painted area"), "light.emitter.radiance.data", random(), step=0.1, depth=2),
+    mean("reflectance, roulette", dome, "dome.bsdf.brdf_0.reflectance.data", random(0.5), depth=8, rr_depth=2),
+)
+MEANS_BY_NAME = {c.name: c for c in MEANS}
+
+
+def in_expectation(cell: Mean, seeds: int) -> tuple[float, float]:
+    """Print a row of the table with `ptracer` beside us; return our z, and our standard error over the gradient."""
+    with opened(cell) as objective:
+        plain = integrator(cell, cell.reference, rr_depth=1000)
+        differences, gradients, theirs = np.array([
+            [
+                objective.dot(objective.difference(plain, CENTRAL, cell.step, 1000 + seed, cell.spp)),
+                objective.backward(integrator(cell, rr_depth=cell.rr_depth), seed, cell.spp),
+                objective.backward(integrator(cell, "ptracer", rr_depth=cell.rr_depth), seed, cell.spp),
+            ]
+            for seed in range(1, seeds + 1)
+        ]).T  # fmt: skip
+    ours, other = gap(gradients, differences), gap(theirs, differences)
+    print(
+        f"{cell.name:22s} {differences.mean():+11.4e}  ours {gradients.mean():+11.4e} ± {ours.error:7.1e}"
+        f" z {ours.z:+6.2f}  ptracer {theirs.mean():+11.4e} ± {other.error:7.1e} z {other.z:+7.2f}",
+        flush=True,
+    )
+    return float(ours.z), float(ours.error / max(abs(differences.mean()), abs(gradients.mean())))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", MEANS, ids=lambda c: c.name)
+def test_mean_gradients_are_mean_differences(cell: Mean) -> None:
+    z, error = in_expectation(cell, SEEDS)
+    assert abs(z) < Z_LIMIT and error < RESOLUTION
+
+
+# ------------------------------ Other variants ------------------------------
+
+
+VARIANTS = """
+import json, sys
+sys.path[:0] = sys.argv[2:]
+from pathreplay.platform.backend import set_variant
+set_variant(sys.argv[1])
+from test_particle_gradients import BY_NAME, MEANS_BY_NAME, in_expectation, same_seed
+print()
+print(json.dumps({
+    "same": [same_seed(BY_NAME[name], BY_NAME[name].spp) for name in
+             ("heights, mirror", "receiver", "thin lens", "x_fov", "point", "area", "radiance", "reflectance")],
+    "mean": [in_expectation(MEANS_BY_NAME[name], 12) for name in ("index, slab", "roughness")],
+}))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_other_variants_have_the_same_gradients(run_python: Callable[..., Any], variant: str) -> None:
+    folders = [str(ROOT / "tests" / "particles"), str(SUPPORT), str(ROOT / "tests")]
+    done = run_python(VARIANTS, args=(variant, *folders))
+    assert done.returncode == 0, done.stderr[-3000:]
+    print(done.stdout)
+    values = json.loads(done.stdout.splitlines()[-1])
+    assert len(values["same"]) == 8 and len(values["mean"]) == 2
+    for error, transpose in values["same"]:
+        assert error < SAME_SEED_MAX and transpose < TRANSPOSE_MAX, values
+    for z, error in values["mean"]:
+        assert abs(z) < Z_LIMIT and error < RESOLUTION, values

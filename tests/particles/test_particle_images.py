@@ -1,0 +1,282 @@
+"""Images of light paths, in expectation: against `path`, and against Mitsuba's `ptracer` where that is right.
+
+Two sets of independent images give the mean of every channel, and the mean of every block of pixels, a difference in
+standard errors. All of these have to be below `Z_LIMIT`. Run with -s to see them as a table.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import particle_scenes
+from particle_scenes import balls, blocks, images, meter, room, sensor
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import Z_LIMIT
+
+DEPTH = 5
+PIXELS = particle_scenes.WIDTH * particle_scenes.HEIGHT
+FEW, MANY = (8, 64), (16, 512)
+"""Seeds, and samples per pixel, of a quick and of a long comparison."""
+
+
+def compared(name: str, ours: np.ndarray, theirs: np.ndarray, most: float = 1.0) -> float:
+    """Print a row of the table, and return the largest |z| of the means of channels and blocks.
+
+    ``most`` is the largest standard error of a mean, relative to it, at which a comparison tells anything.
+    """
+    mean, block = gap(ours.mean((1, 2)), theirs.mean((1, 2))), gap(blocks(ours), blocks(theirs))
+    scale = theirs.mean()
+    error = float(np.max(mean.error)) / scale
+    z = max(float(np.abs(mean.z).max()), float(np.abs(block.z).max()))
+    print(
+        f"{name:48s} mean {scale:8.4f} {ours.mean() / scale - 1:+8.2%} ± {error:6.2%}"
+        f"  z {mean.z[np.abs(mean.z).argmax()]:+6.2f}  blocks {np.abs(block.z).max():5.2f}"
+    )
+    assert scale > 0 and error < most, (name, error)
+    return z
+
+
+def both(name: str, scene: mi.Scene, plugin: str, effort: tuple[int, int], **options: Any) -> float:
+    """Compare the plugin with `path`."""
+    seeds, spp = effort
+    depth = {"max_depth": options.pop("max_depth", DEPTH), "hide_emitters": options.pop("hide_emitters", False)}
+    ours = images(scene, mi.load_dict({"type": plugin, **depth, **options}), range(seeds), spp)
+    theirs = images(scene, mi.load_dict({"type": "path", **depth}), range(1000, 1000 + seeds), spp)
+    return compared(name, ours, theirs, 0.1 if effort == FEW else 0.02)
+
+
+# ------------------------------ All light by light paths ------------------------------
+
+
+@dataclass(frozen=True)
+class Cell:
+    """An emitter, a sensor with its filter, and what perturbs the normals of the floor."""
+
+    light: str
+    eye: str
+    rfilter: str = "gaussian"
+    normals: str = "plain"
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return ", ".join([self.light, self.eye, self.rfilter, self.normals, *self.options])
+
+    def scene(self, light: str = "") -> dict:
+        eye = meter() if self.eye == "meter" else sensor(self.eye, self.rfilter)
+        return room(light or self.light, eye, self.normals)
+
+
+HIDDEN = {"hide_emitters": True}
+CELLS = (
+    Cell("area", "cropped", "gaussian"),
+    Cell("sphere", "thinlens", "tent", "bumpmap"),
+    Cell("mesh", "orthographic", "mitchell", "normalmap"),
+    Cell("point", "perspective", "catmullrom", "bumpmap"),
+    Cell("spot", "meter", "box"),
+    Cell("directional", "perspective", "box", "normalmap"),
+    Cell("directionalarea", "thinlens", "gaussian"),
+    Cell("envmap", "cropped", "tent", "bumpmap"),
+    Cell("constant", "orthographic", "gaussian"),
+    Cell("painted area", "perspective", "mitchell"),
+    Cell("projector", "perspective", "gaussian", "normalmap"),
+    Cell("area", "perspective", "box", options=HIDDEN),
+    Cell("constant", "thinlens", "catmullrom", options=HIDDEN),
+)
+QUICK = ("area, cropped", "sphere", "envmap", "spot")
+
+
+def compare_cell(cell: Cell, effort: tuple[int, int]) -> float:
+    scene = mi.load_dict(cell.scene())
+    if cell.eye == "meter":
+        effort = effort[0], effort[1] * PIXELS
+    if cell.light != "directionalarea":
+        return both(cell.name, scene, "pathreplay_particles", effort, **cell.options)
+    # No camera path finds it; it covers the room, and so it is a directional emitter there.
+    ours = images(scene, mi.load_dict({"type": "pathreplay_particles", "max_depth": DEPTH}), range(effort[0]), effort[1])
+    scene = mi.load_dict(cell.scene("its direction"))
+    theirs = images(scene, mi.load_dict({"type": "path", "max_depth": DEPTH}), range(1000, 1000 + effort[0]), effort[1])
+    return compared(cell.name, ours, theirs)
+
+
+@pytest.mark.parametrize("cell", [c for c in CELLS if c.name.startswith(QUICK)], ids=lambda cell: cell.name)
+def test_light_paths_give_the_image_of_path(cell: Cell) -> None:
+    assert compare_cell(cell, FEW) < Z_LIMIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.name)
+def test_light_paths_give_the_image_of_path_in_the_long_run(cell: Cell) -> None:
+    assert compare_cell(cell, MANY) < Z_LIMIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", [0, 1, 2, 3])
+@pytest.mark.parametrize("hide", [False, True])
+def test_short_paths_are_those_of_path(depth: int, hide: bool) -> None:
+    """With a sphere that shines in view, and a light that is hidden from the camera."""
+    lamp = {"type": "sphere", "center": [0, 1.2, -0.5], "radius": 0.25, "emitter": {"type": "area"}}
+    scene = mi.load_dict(room("area", lamp=lamp))
+    name = f"depth {depth}, hide_emitters = {hide}"
+    if depth == 0 or (hide and depth == 1):
+        ours = images(scene, mi.load_dict({"type": "pathreplay_particles", "max_depth": depth, "hide_emitters": hide}), [0], 8)
+        assert (ours == 0).all()
+    else:
+        assert both(name, scene, "pathreplay_particles", MANY, max_depth=depth, hide_emitters=hide) < Z_LIMIT
+
+
+VARIANTS = """
+import json, sys
+sys.path[:0] = sys.argv[2:]
+from pathreplay.platform.backend import set_variant
+set_variant(sys.argv[1])
+import mitsuba as mi
+from test_particle_images import CELLS, MANY, balls, both, compare_cell
+print()
+print(json.dumps({
+    **{cell.name: compare_cell(cell, MANY) for cell in CELLS[:2] + CELLS[7:8] + CELLS[10:11]},
+    "caustics": both("caustics", mi.load_dict(balls("glass", "mirror")), "pathreplay", MANY, caustics="particles"),
+}))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_other_variants_give_the_image_of_path(run_python, variant: str) -> None:
+    from places import ROOT, SUPPORT
+
+    folders = [str(ROOT / "tests" / "particles"), str(SUPPORT), str(ROOT / "tests")]
+    done = run_python(VARIANTS, args=(variant, *folders))
+    assert done.returncode == 0, done.stderr[-3000:]
+    print(done.stdout)
+    z = json.loads(done.stdout.splitlines()[-1])
+    assert len(z) == 5 and max(z.values()) < Z_LIMIT, z
+
+
+# ------------------------------ Mitsuba's particle tracer ------------------------------
+
+
+RIGHT = (
+    Cell("area", "perspective", "box"),
+    Cell("sphere", "perspective", "tent"),
+    Cell("point", "perspective", "gaussian"),
+    Cell("directional", "thinlens", "mitchell"),
+    Cell("directionalarea", "perspective", "catmullrom"),
+    Cell("projector", "perspective", "gaussian"),
+)
+
+
+def interior(images: np.ndarray) -> np.ndarray:
+    """The images without their borders, where `ptracer` loses what falls outside of the film."""
+    n = particle_scenes.BLOCK // 2
+    return images[:, n:-n, n:-n]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", RIGHT, ids=lambda cell: cell.name)
+def test_light_paths_give_the_image_of_ptracer(cell: Cell) -> None:
+    """Inside of the film, without what `ptracer` gets wrong."""
+    gc.collect()
+    scene = mi.load_dict(cell.scene())
+    ours, theirs = (
+        images(scene, mi.load_dict({"type": plugin, "max_depth": DEPTH}), range(first, first + MANY[0]), MANY[1])
+        for plugin, first in (("pathreplay_particles", 0), ("ptracer", 1000))
+    )
+    assert compared(f"ptracer: {cell.name}", interior(ours), interior(theirs)) < Z_LIMIT
+
+
+WRONG = (
+    Cell("point", "perspective", "box", "bumpmap"),
+    Cell("point", "perspective", "box", "normalmap"),
+    Cell("envmap", "perspective", "box"),
+    Cell("area", "cropped", "box"),
+    Cell("spot", "meter", "box"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", WRONG, ids=lambda cell: cell.name)
+def test_ptracer_is_wrong_where_these_tests_leave_it_out(cell: Cell) -> None:
+    """As soon as one of these fails, the cell belongs to the ones above."""
+    scene, effort = mi.load_dict(cell.scene()), MANY
+    if cell.eye == "meter":
+        effort = MANY[0], MANY[1] * PIXELS
+    theirs, truth = (
+        images(scene, mi.load_dict({"type": plugin, "max_depth": DEPTH}), range(first, first + effort[0]), effort[1])
+        for plugin, first in (("ptracer", 0), ("path", 1000))
+    )
+    if cell.eye != "meter":
+        theirs, truth = interior(theirs), interior(truth)
+    assert compared(f"ptracer against path: {cell.name}", theirs, truth) > Z_LIMIT
+
+
+# ------------------------------ Caustics by light paths ------------------------------
+
+
+CAUSTICS: dict[str, dict] = {
+    **{name: {"materials": (name,)} for name in particle_scenes.MATERIALS},
+    "glass, mirror and plastic": {"materials": ("glass", "mirror", "plastic")},
+    "glass meshes without UV": {"materials": ("glass", "rough metal"), "mesh": True},
+    "instances of glass": {"materials": ("glass", "plastic"), "instances": True},
+    "glass under a ball": {"materials": ("glass", "mirror"), "light": "sphere"},
+    "glass under a sky": {"materials": ("glass", "mirror"), "light": "envmap"},
+    "glass under a sky and a light": {"materials": ("glass", "plastic"), "sky": {"type": "constant", "radiance": 0.3}},
+}
+FAST = ("glass, mirror and plastic",)
+
+
+def compare_caustics(name: str, effort: tuple[int, int], **options: Any) -> float:
+    case = dict(CAUSTICS[name])
+    scene = mi.load_dict(balls(*case.pop("materials"), **case))
+    return both(f"caustics: {name}", scene, "pathreplay", effort, caustics="particles", **options)
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_caustics_by_light_paths_complete_the_image(name: str) -> None:
+    assert compare_caustics(name, FEW) < Z_LIMIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CAUSTICS)
+def test_caustics_by_light_paths_complete_the_image_in_the_long_run(name: str) -> None:
+    assert compare_caustics(name, MANY) < Z_LIMIT
+
+
+@pytest.mark.slow
+def test_caustics_by_light_paths_complete_the_image_without_emitters() -> None:
+    assert compare_caustics("glass, mirror and plastic", MANY, hide_emitters=True) < Z_LIMIT
+
+
+@pytest.mark.parametrize("light", ["point", pytest.param("spot", marks=pytest.mark.slow)])
+def test_caustics_of_lights_that_camera_paths_never_meet_are_there(light: str) -> None:
+    """Against all light by light paths; the glass is out of view, and so both see everything."""
+    scene = mi.load_dict(balls(light=light, glass={
+        "type": "sphere", "center": [0.2, 1.6, -0.1], "radius": 0.2, "bsdf": {"type": "dielectric"},
+    }, sensor=sensor(look=mi.ScalarTransform4f().look_at([0, 1.2, -2.6], [0, 0, 0], [0, 1, 0]))))  # fmt: skip
+    ours, theirs, without = (
+        images(scene, mi.load_dict({"type": plugin, "max_depth": DEPTH, **options}), range(first, first + 8), 128)
+        for plugin, first, options in (
+            ("pathreplay", 0, {"caustics": "particles"}),
+            ("pathreplay_particles", 1000, {}),
+            ("pathreplay", 2000, {}),
+        )
+    )
+    assert compared(f"caustics: {light} and glass", ours, theirs) < Z_LIMIT
+    assert without.mean() < 0.95 * ours.mean()
+
+
+def test_no_light_path_is_left_out_and_none_counts_twice() -> None:
+    """Without delta lobes, the light paths of caustics add nothing."""
+    scene = mi.load_dict(balls("diffuse", "rough glass"))
+    with_paths, without = (
+        images(scene, mi.load_dict({"type": "pathreplay", "max_depth": DEPTH, **options}), [3], 16)
+        for options in ({"caustics": "particles"}, {})
+    )
+    assert np.allclose(with_paths, without, rtol=1e-5)

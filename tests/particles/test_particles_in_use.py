@@ -1,0 +1,419 @@
+"""Light paths in use: what is refused, which parameters reach them, warnings, jobs, and many paths."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import pathreplay
+from particle_scenes import HEIGHT, WIDTH, balls, dome, film, images, meter, panel, room, sensor, slab
+from pathreplay import Parameter, PathreplayError, Problem, View
+from pathreplay.cli import app
+from pathreplay.inverse.config.schema import make_config
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import optimize
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import Z_LIMIT
+from recorded_steps import steps
+from truth import rgb
+
+PARTICLES = {"type": "pathreplay_particles", "max_depth": 3, "boundary": "none"}
+CAUSTICS = {"type": "pathreplay", "max_depth": 4, "boundary": "none", "caustics": "particles"}
+BOTH = pytest.mark.parametrize("plugin", [PARTICLES, CAUSTICS], ids=["all", "caustics"])
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    gc.collect()
+
+
+@pytest.fixture
+def log() -> Iterator[list[str]]:
+    """The warnings of Mitsuba's log."""
+    lines: list[str] = []
+
+    class Kept(mi.Appender):
+        def append(self, level: mi.LogLevel, text: str) -> None:
+            if level >= mi.LogLevel.Warn:
+                lines.append(text)
+
+        def log_progress(self, *_: Any) -> None: ...
+
+    kept = Kept()
+    mi.logger().add_appender(kept)
+    yield lines
+    mi.logger().remove_appender(kept)
+
+
+def loaded(scene: dict) -> mi.Scene:
+    return mi.load_dict(scene, optimize=False)
+
+
+def gradient(scene: mi.Scene, plugin: dict, key: str, spp: int = 16, seed: int = 2) -> np.ndarray:
+    """Gradient of the sum of the image, weighted by a wave."""
+    params = mi.traverse(scene)
+    value = params[key]
+    value = value.matrix if key.endswith("to_world") else value
+    dr.enable_grad(value)
+    if key.endswith("to_world"):
+        params[key] = type(params[key])(value)
+    params.update()
+    integrator = mi.load_dict(plugin)
+    try:
+        integrator.render_backward(scene, params, mi.TensorXf(weights(scene)), 0, seed, spp)
+        return np.array(dr.grad(value), np.float64)
+    finally:
+        dr.disable_grad(value)
+        params[key] = dr.detach(params[key])
+        params.update()
+
+
+def weights(scene: mi.Scene) -> np.ndarray:
+    width, height = scene.sensors()[0].film().crop_size()
+    wave = 1 + 0.5 * np.cos(np.arange(int(width) * int(height) * 3))
+    return wave.reshape(int(height), int(width), 3).astype(np.float32)
+
+
+def weighted(scene: mi.Scene, plugin: dict, spp: int = 16, seed: int = 2) -> float:
+    return float(np.vdot(weights(scene), images(scene, mi.load_dict(plugin), [seed], spp)[0]))
+
+
+# ------------------------------ What is refused ------------------------------
+
+
+def with_film(**changes: Any) -> dict:
+    return {**sensor(), "film": {**film(), **changes}}
+
+
+CHECKERS = {"type": "checkerboard"}
+FOG = {"type": "homogeneous", "albedo": 0.5}
+REFUSED: dict[str, tuple[Callable[[], dict], str]] = {
+    "medium": (
+        lambda: room(fog={"type": "cube", "bsdf": {"type": "null"}, "interior": FOG}),
+        "light paths do not pass through media yet: remove the media from the scene, or trace all paths",
+    ),
+    "radiancemeter": (
+        lambda: room(eye={"type": "radiancemeter", "id": "eye", "film": {**film(), "width": 1, "height": 1}}),
+        "light paths cannot be connected to sensor 'eye' of class RadianceMeter: take perspective",
+    ),
+    "distant": (
+        lambda: room(eye={"type": "distant", "id": "eye", "film": {**film(), "width": 1, "height": 1}}),
+        "light paths cannot be connected to sensor 'eye' of class DistantSensor: take perspective",
+    ),
+    "spectra": (
+        lambda: room(eye={
+            **sensor(), "id": "eye",
+            "film": {
+                "type": "specfilm", "width": 4, "height": 4, "sample_border": True,
+                "band": {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]},
+            },
+        }),
+        "light paths cannot be added to the film of sensor 'eye'",
+    ),
+    "painted in checkers": (
+        lambda: room(light="area", lamp=panel(CHECKERS)),
+        "no light path can start at emitter",
+    ),
+    "meter of several pixels": (
+        lambda: room(eye={**meter(), "meter": {**meter()["meter"], "film": {**film(), "width": 4, "height": 2}}}),
+        "has a film of 4 x 2 pixels, which all have the same value: give it a film of one pixel",
+    ),
+}  # fmt: skip
+
+
+@BOTH
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_light_paths_cannot_render_is_refused_in_one_line(case: str, plugin: dict) -> None:
+    scene, message = REFUSED[case]
+    made = mi.load_dict(scene())
+    with pytest.raises(PathreplayError) as caught:
+        mi.load_dict(plugin).render(made, spp=1)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+PROPERTIES: dict[str, tuple[dict, str]] = {
+    "unknown caustics": (
+        {**CAUSTICS, "caustics": "photons"},
+        "pathreplay: caustics = 'photons' is unknown: use one of 'camera', 'particles'",
+    ),
+    "caustics of particles": ({**PARTICLES, "caustics": "particles"}, "caustics"),
+    "samples_per_pass": (
+        {**PARTICLES, "samples_per_pass": 0},
+        "pathreplay_particles: samples_per_pass = 0: use -1 (unbounded) or a number of samples >= 1",
+    ),
+    "depth": ({**PARTICLES, "max_depth": -2}, "pathreplay_particles: max_depth = -2: use -1 (unbounded)"),
+    "boundary": ({**PARTICLES, "boundary": "some"}, "pathreplay_particles: boundary = 'some' is unknown"),
+}
+
+
+@pytest.mark.parametrize("case", PROPERTIES)
+def test_bad_properties_are_named(case: str) -> None:
+    plugin, message = PROPERTIES[case]
+    with pytest.raises(Exception, match="") as caught:  # Mitsuba wraps what a plugin raises
+        mi.load_dict(plugin)
+    assert message in str(caught.value), str(caught.value)
+
+
+@BOTH
+def test_derivatives_of_unbounded_paths_are_refused(plugin: dict) -> None:
+    scene = loaded(balls("glass"))
+    unbounded = {**plugin, "max_depth": -1}
+    assert mi.load_dict(unbounded).render(scene, spp=1).shape == (HEIGHT, WIDTH, 3)
+    with pytest.raises(PathreplayError) as caught:
+        gradient(scene, unbounded, "floor.bsdf.reflectance.value")
+    assert "max_depth" in str(caught.value) and "\n" not in str(caught.value)
+    assert "unbounded" in str(caught.value)
+
+
+# ------------------------------ Which parameters reach them ------------------------------
+
+
+def linear_error(scene: dict, plugin: dict, key: str, spp: int = 16) -> float:
+    """Relative error of a gradient with respect to a parameter that scales the image: d F / d log x is F."""
+    made = loaded(scene)
+    value = np.array(mi.traverse(made)[key], np.float64)
+    return float((gradient(made, plugin, key, spp) * value).sum() / weighted(made, plugin, spp) - 1)
+
+
+@BOTH
+def test_an_intensity_scales_the_image(plugin: dict) -> None:
+    """It reaches both light paths and camera paths."""
+    assert abs(linear_error(balls("glass", light="point"), plugin, "light.intensity.value")) < 1e-5
+
+
+def test_a_colour_that_only_light_paths_reach_has_its_gradient() -> None:
+    """The camera rays of `pathreplay_particles` see emitters, and end."""
+    scene = balls(light="point")
+    assert abs(linear_error(scene, {**PARTICLES, "max_depth": 2}, "floor.bsdf.reflectance.value")) < 1e-5
+
+
+def test_a_sky_that_only_camera_paths_reach_has_its_gradient() -> None:
+    scene = loaded(balls("glass", light="constant"))
+    key = "light.radiance.value"
+    ours, theirs = (gradient(scene, {**CAUSTICS, "caustics": kind}, key) for kind in ("particles", "camera"))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5)
+    assert ours.min() > 0
+    assert images(scene, mi.load_dict(CAUSTICS), [1], 8) == pytest.approx(
+        images(scene, mi.load_dict({**CAUSTICS, "caustics": "camera"}), [1], 8), rel=1e-5
+    )
+
+
+@BOTH
+def test_what_reaches_nothing_is_named(plugin: dict) -> None:
+    """With attach = 'none', nothing moves."""
+    scene = loaded(balls("glass", light="point"))
+    with pytest.raises(PathreplayError) as caught:
+        gradient(scene, {**plugin, "attach": "none"}, "light.position")
+    message = str(caught.value)
+    assert "no parameter with gradients reaches the light paths of sensor" in message and "\n" not in message
+    assert "'light.position' has gradients" in message
+
+
+@BOTH
+def test_a_scene_without_emitters_is_black(plugin: dict) -> None:
+    scene = balls("glass")
+    del scene["light"]
+    made = loaded(scene)
+    assert (images(made, mi.load_dict(plugin), [1], 4) == 0).all()
+    try:
+        assert (gradient(made, plugin, "floor.bsdf.reflectance.value", 4) == 0).all()
+    except PathreplayError as error:
+        assert "no parameter with gradients reaches the light paths" in str(error) and "\n" not in str(error)
+
+
+def test_a_sky_alone_lights_the_scene() -> None:
+    """Light paths start at environments unless they trace caustics only."""
+    scene = loaded(balls(light="constant"))
+    ours, theirs = (
+        images(scene, mi.load_dict({**plugin, "max_depth": 3}), range(8), 256)
+        for plugin in (PARTICLES, {"type": "path"})
+    )
+    assert np.abs(gap(ours.mean((1, 2)), theirs.mean((1, 2))).z).max() < Z_LIMIT
+
+
+# ------------------------------ What is said ------------------------------
+
+
+def test_motion_on_a_film_with_a_box_filter_is_told_once(log: list[str]) -> None:
+    for rfilter, count in (("gaussian", 0), ("box", 1)):
+        scene = loaded(slab(eye="perspective"))
+        own = scene.sensors()[0]
+        assert not own.film().rfilter().is_box_filter()
+        made = slab()
+        made["sensor"]["film"]["rfilter"]["type"] = rfilter
+        scene, integrator = loaded(made), mi.load_dict({**PARTICLES, "max_depth": 4})
+        params = mi.traverse(scene)
+        dr.enable_grad(params["top.vertex_positions"])
+        params.update()
+        for seed in (1, 2):
+            integrator.render_backward(scene, params, mi.TensorXf(weights(scene)), 0, seed, 4)
+        told = [line for line in log if "box filter" in line]
+        assert len(told) == count, log
+    assert "\n" not in told[0] and "give the film another rfilter, such as gaussian" in told[0]
+
+
+def test_colours_on_a_film_with_a_box_filter_are_told_nothing(log: list[str]) -> None:
+    scene = balls(light="point", sensor=sensor(rfilter="box"))
+    gradient(loaded(scene), PARTICLES, "floor.bsdf.reflectance.value", 4)
+    assert not log
+
+
+def test_pixel_sweeps_are_refused_with_the_remedy() -> None:
+    scene = loaded(balls("glass"))
+    caustics, everything = mi.load_dict({**CAUSTICS, "adjoint": "recorded"}), mi.load_dict(PARTICLES)
+    assert caustics.why_no_pixel_sweep(scene).endswith("take caustics = 'camera'")
+    for adjoint in ("auto", "recorded"):
+        everything = mi.load_dict({**PARTICLES, "adjoint": adjoint})
+        assert everything.why_no_pixel_sweep(scene).endswith("take the integrator 'pathreplay'")
+
+
+def test_integrators_name_their_caustics() -> None:
+    for plugin, kind in ((CAUSTICS, "particles"), (PARTICLES, "particles"), ({"type": "pathreplay"}, "camera")):
+        made = mi.load_dict(plugin)
+        assert made.options()["caustics"] == kind and f"caustics = {kind}" in str(made)
+
+
+# ------------------------------ Options and many paths ------------------------------
+
+
+def test_samples_per_pass_changes_nothing() -> None:
+    scene = loaded(balls(light="point"))
+    a, b = (images(scene, mi.load_dict({**PARTICLES, **more}), [5], 16) for more in ({}, {"samples_per_pass": 100}))
+    np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+
+
+def test_lanes_trace_several_paths_each() -> None:
+    """More paths than lanes, and not a multiple of them: all are rendered, and all are differentiated."""
+    spp = 900
+    number = spp * WIDTH * HEIGHT
+    assert number > 2**16 and number % 2**16
+    scene = balls(light="point")
+    assert abs(linear_error(scene, {**PARTICLES, "max_depth": 2}, "light.intensity.value", spp)) < 1e-4
+    made = loaded(scene)
+    many, few = (images(made, mi.load_dict(PARTICLES), range(n), spp).mean((1, 2)) for n, spp in ((4, spp), (16, 64)))
+    assert np.abs(gap(many, few).z).max() < Z_LIMIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rr_depth", [1, 2, 4])
+def test_roulette_keeps_the_mean(rr_depth: int) -> None:
+    scene = loaded(dome())
+    ours, theirs = (
+        images(scene, mi.load_dict({**PARTICLES, "max_depth": 8, "rr_depth": n}), range(first, first + 16), 512)
+        for n, first in ((rr_depth, 0), (1000, 100))
+    )
+    assert np.abs(gap(ours.mean((1, 2)), theirs.mean((1, 2))).z).max() < Z_LIMIT
+
+
+def test_scenes_do_not_disturb_each_other() -> None:
+    """An image and a gradient, before and after those of another scene that stays alive."""
+    first = loaded(balls("glass", light="point"))
+    key = "light.intensity.value"
+    image, g = images(first, mi.load_dict(CAUSTICS), [3], 8), gradient(first, CAUSTICS, key)
+    second = loaded(dome("spot"))
+    params = mi.traverse(second)
+    dr.enable_grad(params["light.intensity.value"])
+    params.update()
+    assert (images(second, mi.load_dict(PARTICLES), [3], 8) > 0).any()
+    np.testing.assert_allclose(images(first, mi.load_dict(CAUSTICS), [3], 8), image, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(gradient(first, CAUSTICS, key), g, rtol=1e-4)
+
+
+# ------------------------------ Jobs ------------------------------
+
+
+FLOOR = "floor.bsdf.reflectance.value"
+
+
+def problem(plugin: dict) -> Problem:
+    scene = balls("glass", light="point")
+    target = np.full((HEIGHT, WIDTH, 3), 0.3, np.float32)
+    return Problem(
+        scene, {FLOOR: Parameter(initial=[0.4, 0.4, 0.4], bounds=(0, 1))}, [View("sensor", target)],
+        integrator=plugin, spp=8, learning_rate=0.05,
+    )  # fmt: skip
+
+
+@BOTH
+def test_minimize_descends(plugin: dict) -> None:
+    result = pathreplay.minimize(problem(plugin), steps=4, progress=False)
+    losses = [entry.loss for entry in result.history]
+    assert losses[-1] < losses[0] and np.isfinite(losses).all()
+
+
+SCENE = """<scene version="3.0.0">
+  {integrator}
+  <sensor type="perspective" id="eye"><transform name="to_world"><lookat origin="0,2,-3" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/>
+      <boolean name="sample_border" value="true"/><string name="pixel_format" value="rgb"/></film></sensor>
+  <shape type="rectangle" id="floor"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
+  <shape type="sphere" id="ball"><point name="center" x="0.2" y="1" z="0"/><float name="radius" value="0.4"/>
+    <bsdf type="dielectric"/></shape>
+  <emitter type="point" id="lamp"><point name="position" x="0.3" y="3" z="0"/>
+    <rgb name="intensity" value="9"/></emitter>
+</scene>"""
+OWN = """<integrator type="pathreplay"><integer name="max_depth" value="4"/>
+    <string name="caustics" value="particles"/></integrator>"""
+JOB: dict[str, Any] = {
+    "scene": "scene.xml",
+    "iterations": 2,
+    "spp": 8,
+    "eval_spp": 8,
+    "parameters": [{"key": "floor.bsdf.reflectance.value", "initial": [0.2, 0.3, 0.4]}],
+    "target": {"values": {"floor.bsdf.reflectance.value": [0.6, 0.5, 0.4]}, "spp": 16},
+}
+
+
+def job(integrator: dict | None = CAUSTICS, own: str = "", **more: Any) -> Any:
+    Path("scene.xml").write_text(SCENE.format(integrator=own))
+    return make_config({**JOB, **({} if integrator is None else {"integrator": integrator}), **more})
+
+
+@BOTH
+def test_jobs_run_light_paths(plugin: dict) -> None:
+    result = optimize(job({**plugin, "boundary": "auto"}), progress=False)
+    history = (result.folder / "history.jsonl").read_text().splitlines()
+    assert len(history) == 2 and (result.folder / "report.html").is_file()
+
+
+def test_a_job_takes_the_caustics_of_its_scene() -> None:
+    built = build_problem(job(None, OWN), Path.cwd())
+    assert built.integrator.caustics == "particles" and built.integrator.max_depth == 4
+
+
+@BOTH
+def test_recorded_steps_are_traced_steps(plugin: dict) -> None:
+    config = job(plugin, iterations=4)
+    made = build_problem(config, Path.cwd())
+    np.testing.assert_allclose(steps(made, config, "recorded"), steps(made, config, "traced"), rtol=1e-4)
+
+
+@pytest.mark.slow
+@BOTH
+def test_deterministic_jobs_repeat_to_the_bit(plugin: dict) -> None:
+    values = [
+        optimize(job(plugin, deterministic=True, output=name), progress=False).values for name in ("first", "second")
+    ]
+    for key, value in values[0].items():
+        np.testing.assert_array_equal(value, values[1][key])
+
+
+@pytest.mark.slow
+def test_check_passes_light_paths() -> None:
+    Path("scene.xml").write_text(SCENE.format(integrator=OWN.replace("pathreplay", "pathreplay_particles").replace(
+        '<string name="caustics" value="particles"/>', '')))  # fmt: skip
+    reference = ["--reference", "pathreplay_particles"]
+    command = ["check", "scene.xml", "--param", "floor.bsdf.reflectance.value", "--seeds", "6", "--spp", "64"]
+    done = CliRunner().invoke(app, [*command, *reference])
+    assert done.exit_code == 0, done.output
+    assert "pathreplay_particles" in done.output or "particle" in done.output
