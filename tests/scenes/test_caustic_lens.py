@@ -16,6 +16,7 @@ from pathreplay.inverse.parameters.displace import displacement_of
 from pathreplay.jobs import make_config, optimize
 from pathreplay.output.export import export_run
 from pathreplay.scenes.caustic_lens import caustic_lens, slab
+from pathreplay.scenes.loading import load_scene
 from pathreplay.scenes.parameters import get_array
 
 KEY = "lens.vertex_positions"
@@ -123,3 +124,8 @@ def test_a_slab_takes_any_material() -> None:
     made = slab(3, 3, 2.0, 0.5, {"type": "dielectric_ad", "int_ior": 1.4})
     assert "bsdf.eta" in mi.traverse(made)
     assert volume_if_closed(get_array(mi.traverse(made)["vertex_positions"]), np.array(mi.traverse(made)["faces"]))
+
+
+def test_a_slab_without_area_is_refused_in_one_line() -> None:
+    with pytest.raises(pathreplay.PathreplayError, match="has 1 rows and 4 columns of vertices; give at least 2"):
+        load_scene("caustic-lens", rows=1, columns=4)

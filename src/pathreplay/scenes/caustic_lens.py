@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.errors import PathreplayError
 from pathreplay.platform import compat
 from pathreplay.types import SceneDict
 
@@ -63,7 +64,11 @@ def slab(rows: int, columns: int, width: float, thickness: float, bsdf: dict[str
     coordinates are those of the map, and its normals are smooth. The lower face and the sides are flat; they share
     positions with the upper face, but no vertices. The attribute ``vertex_weight`` is 1 at all vertices of the plane z
     = 0, and 0 below.
+
+    Raises PathreplayError if there are fewer than two rows or columns.
     """
+    if min(rows, columns) < 2:
+        raise PathreplayError(f"A slab has {rows} rows and {columns} columns of vertices; give at least 2 of each")
     u, v = ((np.arange(n) + 0.5) / n for n in (columns, rows))
     x, y = (u - 0.5) * width, (v - 0.5) * width * rows / columns
     n = len(x)

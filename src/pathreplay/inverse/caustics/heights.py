@@ -12,6 +12,7 @@ Normals of step 2 depend on the heights, so steps 2 and 3 are repeated. Fresnel 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.caustics.monge_ampere import Field, poisson_solver, potential
+from pathreplay.platform import memory
 
+_A_CELL = 800
+"""Bytes per cell of the height map that the transport takes at its peak."""
+_MARGIN = 1e-9
+"""Width of the border of a triangle that counts as its interior, relative to its size."""
 _ROUNDS = 5
 """Repetitions of steps 2 and 3, and of step 1 if the light is not collimated."""
 
@@ -143,6 +149,8 @@ def _density(image: ArrayLike, shape: tuple[int, int] | None, floor: float) -> F
         )
     if not 0 < floor < 1:
         raise PathreplayError(f"floor is {floor:g}; give a fraction between 0 and 1, such as 0.02")
+    cells = math.prod(density.shape if shape is None else shape)
+    memory.require(_A_CELL * cells, f"Transport of light for {cells} heights", "use fewer cells")
     if shape is not None and tuple(shape) != density.shape:
         if min(shape) < 2:
             raise PathreplayError(f"The height map has the shape {tuple(shape)}; give at least two rows and columns")
@@ -172,13 +180,46 @@ def _sources(φ: Field, margin: int = 0) -> tuple[Field, Field]:
 
 
 def _receivers(φ: Field) -> tuple[Field, Field]:
-    """Return the point T(x) of the receiver for each cell of the exit surface, in cells: the inverse of `_sources`."""
-    sources = np.stack(_sources(φ, 1), -1).reshape(-1, 2)
+    """Return the point T(x) of the receiver for each cell of the exit surface, in cells: the inverse of `_sources`.
+
+    S maps the squares between cells of the receiver to quadrilaterals that cover the exit surface. T is linear in each
+    of their two triangles. (A Delaunay triangulation of the corners takes minutes where S is close to the identity,
+    because the corners of squares lie on circles.)
+    """
+    shape = np.array(φ.shape)
+    points = np.stack(_sources(φ, 1), -1)
     rows, columns = (np.arange(-1.0, n + 1) for n in φ.shape)
     ends = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2)
-    inverse = scipy.interpolate.LinearNDInterpolator(sources, ends)
-    found = inverse(*np.meshgrid(*(np.arange(n) for n in φ.shape), indexing="ij"))
+    index = np.arange(len(ends)).reshape(points.shape[:2])
+    a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel()
+    triangles = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
+    corners = points.reshape(-1, 2)[triangles]
+    # All cells in the bounding box of each triangle, one after another.
+    low = np.clip(np.ceil(corners.min(axis=1)), 0, shape).astype(int)
+    high = np.clip(np.floor(corners.max(axis=1)), -1, shape - 1).astype(int)
+    sides = np.maximum(high - low + 1, 0)
+    counts = sides.prod(axis=1)
+    owner = np.repeat(np.arange(len(triangles)), counts)
+    rank = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    cells = low[owner] + np.stack([rank // sides[owner, 1], rank % sides[owner, 1]], -1)
+    p, q, r = (corners[owner, i] for i in range(3))
+    area = _cross(q - p, r - p)
+    area = np.where(area == 0, np.inf, area)
+    second, third = _cross(cells - p, r - p) / area, _cross(q - p, cells - p) / area
+    weights = np.stack([1 - second - third, second, third], -1)
+    inside = weights.min(axis=1) > -_MARGIN
+    found = np.full((*φ.shape, 2), np.nan)
+    y, x = cells[inside].T
+    found[y, x] = np.einsum("ni,nij->nj", weights[inside], ends[triangles[owner[inside]]])
+    missing = np.isnan(found[..., 0])
+    if missing.any():  # rounding errors beside a triangle without area
+        y, x = scipy.ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
+        found = found[y, x]
     return found[..., 0], found[..., 1]
+
+
+def _cross(a: Field, b: Field) -> Field:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _at(field: Field, rows: Field, columns: Field) -> Field:
