@@ -72,7 +72,7 @@ def normal_in_frame(
     nearly zero, but only the drift could be differentiated.
     """
     n = dr.detach(si.to_local(si.n))
-    y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    y = hit.compute_surface_interaction(ray, compat.shading() | compat.follow_shape(), active)
     if not dr.grad_enabled(y.n, y.sh_frame.n):
         return n
     turned = dr.detach(si).to_local(dr.detach(y).to_world(y.to_local(y.n)))
