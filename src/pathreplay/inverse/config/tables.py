@@ -69,7 +69,9 @@ class Plugin(BaseModel):
 
     @model_validator(mode="after")
     def _has_edges(self) -> Plugin:
-        if self.type not in ("pathreplay", "pathreplay_particles") and (asked := {"boundary", "boundary_spp"} & set(self.model_extra or {})):
+        if self.type not in ("pathreplay", "pathreplay_particles") and (
+            asked := {"boundary", "boundary_spp"} & set(self.model_extra or {})
+        ):
             raise ValueError(
                 f"'{min(asked)}' is an option of the integrator 'pathreplay', which '{self.type}' does not have; "
                 "remove it"
