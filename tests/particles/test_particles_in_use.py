@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pathreplay
-from particle_scenes import HEIGHT, WIDTH, balls, dome, film, images, meter, panel, room, sensor, slab
+from particle_scenes import HEIGHT, WIDTH, balls, dome, images, meter, panel, room, sensor, slab
 from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.cli import app
 from pathreplay.inverse.config.schema import make_config
@@ -23,7 +23,6 @@ from pathreplay.jobs import optimize
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
 from recorded_steps import steps
-from truth import rgb
 
 PARTICLES = {"type": "pathreplay_particles", "max_depth": 3, "boundary": "none"}
 CAUSTICS = {"type": "pathreplay", "max_depth": 4, "boundary": "none", "caustics": "particles"}
@@ -44,7 +43,7 @@ def log() -> Iterator[list[str]]:
     class Kept(mi.Appender):
         def append(self, level: mi.LogLevel, text: str) -> None:
             if level >= mi.LogLevel.Warn:
-                lines.append(text)
+                lines.append(text.strip())
 
         def log_progress(self, *_: Any) -> None: ...
 
@@ -90,10 +89,7 @@ def weighted(scene: mi.Scene, plugin: dict, spp: int = 16, seed: int = 2) -> flo
 # ------------------------------ What is refused ------------------------------
 
 
-def with_film(**changes: Any) -> dict:
-    return {**sensor(), "film": {**film(), **changes}}
-
-
+SMALL = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
 CHECKERS = {"type": "checkerboard"}
 FOG = {"type": "homogeneous", "albedo": 0.5}
 REFUSED: dict[str, tuple[Callable[[], dict], str]] = {
@@ -102,29 +98,19 @@ REFUSED: dict[str, tuple[Callable[[], dict], str]] = {
         "light paths do not pass through media yet: remove the media from the scene, or trace all paths",
     ),
     "radiancemeter": (
-        lambda: room(eye={"type": "radiancemeter", "id": "eye", "film": {**film(), "width": 1, "height": 1}}),
+        lambda: room(eye={"type": "radiancemeter", "id": "eye", "film": SMALL}),
         "light paths cannot be connected to sensor 'eye' of class RadianceMeter: take perspective",
     ),
     "distant": (
-        lambda: room(eye={"type": "distant", "id": "eye", "film": {**film(), "width": 1, "height": 1}}),
-        "light paths cannot be connected to sensor 'eye' of class DistantSensor: take perspective",
-    ),
-    "spectra": (
-        lambda: room(eye={
-            **sensor(), "id": "eye",
-            "film": {
-                "type": "specfilm", "width": 4, "height": 4, "sample_border": True,
-                "band": {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]},
-            },
-        }),
-        "light paths cannot be added to the film of sensor 'eye'",
+        lambda: room(eye={"type": "distant", "id": "eye", "film": SMALL}),
+        "light paths cannot be connected to sensor 'eye' of class DistantSensor",
     ),
     "painted in checkers": (
         lambda: room(light="area", lamp=panel(CHECKERS)),
         "no light path can start at emitter",
     ),
     "meter of several pixels": (
-        lambda: room(eye={**meter(), "meter": {**meter()["meter"], "film": {**film(), "width": 4, "height": 2}}}),
+        lambda: room(eye={**meter(), "meter": {**meter()["meter"], "film": {**SMALL, "width": 4, "height": 2}}}),
         "has a film of 4 x 2 pixels, which all have the same value: give it a film of one pixel",
     ),
 }  # fmt: skip
@@ -138,6 +124,27 @@ def test_what_light_paths_cannot_render_is_refused_in_one_line(case: str, plugin
     with pytest.raises(PathreplayError) as caught:
         mi.load_dict(plugin).render(made, spp=1)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+SPECTRA = """
+from pathreplay.platform.backend import set_variant
+set_variant("llvm_ad_spectral")
+import mitsuba as mi
+band = {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}
+film = {"type": "specfilm", "width": 4, "height": 4, "band": band}
+eye = {"type": "perspective", "fov": 40, "film": film, "id": "eye"}
+scene = mi.load_dict({"type": "scene", "eye": eye, "lamp": {"type": "point"}})
+try:
+    mi.load_dict({"type": "pathreplay_particles"}).render(scene, spp=1)
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+
+
+def test_films_of_spectra_are_refused_in_one_line(run_python: Callable[..., Any]) -> None:
+    done = run_python(SPECTRA)
+    expected = "PathreplayError light paths cannot be added to the film of sensor 'eye': a SpecFilm stores spectra"
+    assert done.returncode == 0 and done.stdout.strip().splitlines()[-1].startswith(expected), done
 
 
 PROPERTIES: dict[str, tuple[dict, str]] = {
@@ -158,7 +165,7 @@ PROPERTIES: dict[str, tuple[dict, str]] = {
 @pytest.mark.parametrize("case", PROPERTIES)
 def test_bad_properties_are_named(case: str) -> None:
     plugin, message = PROPERTIES[case]
-    with pytest.raises(Exception, match="") as caught:  # Mitsuba wraps what a plugin raises
+    with pytest.raises(Exception) as caught:  # Mitsuba wraps what a plugin raises
         mi.load_dict(plugin)
     assert message in str(caught.value), str(caught.value)
 
@@ -170,8 +177,8 @@ def test_derivatives_of_unbounded_paths_are_refused(plugin: dict) -> None:
     assert mi.load_dict(unbounded).render(scene, spp=1).shape == (HEIGHT, WIDTH, 3)
     with pytest.raises(PathreplayError) as caught:
         gradient(scene, unbounded, "floor.bsdf.reflectance.value")
-    assert "max_depth" in str(caught.value) and "\n" not in str(caught.value)
-    assert "unbounded" in str(caught.value)
+    message = "max_depth = -1 (unbounded) is more than the record of a light path can hold: take up to 2049 where"
+    assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
 
 
 # ------------------------------ Which parameters reach them ------------------------------
@@ -245,9 +252,6 @@ def test_a_sky_alone_lights_the_scene() -> None:
 
 def test_motion_on_a_film_with_a_box_filter_is_told_once(log: list[str]) -> None:
     for rfilter, count in (("gaussian", 0), ("box", 1)):
-        scene = loaded(slab(eye="perspective"))
-        own = scene.sensors()[0]
-        assert not own.film().rfilter().is_box_filter()
         made = slab()
         made["sensor"]["film"]["rfilter"]["type"] = rfilter
         scene, integrator = loaded(made), mi.load_dict({**PARTICLES, "max_depth": 4})
@@ -258,7 +262,7 @@ def test_motion_on_a_film_with_a_box_filter_is_told_once(log: list[str]) -> None
             integrator.render_backward(scene, params, mi.TensorXf(weights(scene)), 0, seed, 4)
         told = [line for line in log if "box filter" in line]
         assert len(told) == count, log
-    assert "\n" not in told[0] and "give the film another rfilter, such as gaussian" in told[0]
+    assert "\n" not in told[0] and "use a 'tent' or 'gaussian' filter" in told[0]
 
 
 def test_colours_on_a_film_with_a_box_filter_are_told_nothing(log: list[str]) -> None:
@@ -352,10 +356,12 @@ def test_minimize_descends(plugin: dict) -> None:
 
 SCENE = """<scene version="3.0.0">
   {integrator}
-  <sensor type="perspective" id="eye"><transform name="to_world"><lookat origin="0,2,-3" target="0,0,0" up="0,1,0"/></transform>
+  <sensor type="perspective" id="eye">
+    <transform name="to_world"><lookat origin="0,2,-3" target="0,0,0" up="0,1,0"/></transform>
     <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/>
       <boolean name="sample_border" value="true"/><string name="pixel_format" value="rgb"/></film></sensor>
-  <shape type="rectangle" id="floor"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/></transform>
+  <shape type="rectangle" id="floor">
+    <transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/></transform>
     <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
   <shape type="sphere" id="ball"><point name="center" x="0.2" y="1" z="0"/><float name="radius" value="0.4"/>
     <bsdf type="dielectric"/></shape>
@@ -401,19 +407,16 @@ def test_recorded_steps_are_traced_steps(plugin: dict) -> None:
 @pytest.mark.slow
 @BOTH
 def test_deterministic_jobs_repeat_to_the_bit(plugin: dict) -> None:
-    values = [
-        optimize(job(plugin, deterministic=True, output=name), progress=False).values for name in ("first", "second")
-    ]
-    for key, value in values[0].items():
-        np.testing.assert_array_equal(value, values[1][key])
+    runs = [optimize(job(plugin, deterministic=True, output=name), progress=False) for name in ("first", "second")]
+    first, second = ((run.folder / "parameters.safetensors").read_bytes() for run in runs)
+    assert first == second
 
 
 @pytest.mark.slow
 def test_check_passes_light_paths() -> None:
-    Path("scene.xml").write_text(SCENE.format(integrator=OWN.replace("pathreplay", "pathreplay_particles").replace(
-        '<string name="caustics" value="particles"/>', '')))  # fmt: skip
-    reference = ["--reference", "pathreplay_particles"]
+    scene = SCENE.format(integrator='<integrator type="pathreplay_particles"/>').replace("dielectric", "diffuse")
+    Path("scene.xml").write_text(scene)
     command = ["check", "scene.xml", "--param", "floor.bsdf.reflectance.value", "--seeds", "6", "--spp", "64"]
-    done = CliRunner().invoke(app, [*command, *reference])
+    done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
-    assert "pathreplay_particles" in done.output or "particle" in done.output
+    assert "particle (backward)" in done.output, done.output

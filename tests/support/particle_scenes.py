@@ -98,7 +98,14 @@ def film(rfilter: str = "gaussian", **more: Any) -> dict:
     return {**own, **shape, **more}
 
 
-CROPPED = {"width": 24, "height": 20, "crop_offset_x": 3, "crop_offset_y": 5, "crop_width": WIDTH, "crop_height": HEIGHT}
+CROPPED = {
+    "width": 24,
+    "height": 20,
+    "crop_offset_x": 3,
+    "crop_offset_y": 5,
+    "crop_width": WIDTH,
+    "crop_height": HEIGHT,
+}
 
 
 def sensor(kind: str = "perspective", rfilter: str = "gaussian", look: Any = None, **more: Any) -> dict:
@@ -245,9 +252,8 @@ def balls(*materials: str, light: str = "area", mesh: bool = False, instances: b
             body = round_mesh(320, 0.45, (0, 0, 0) if instances else center, MATERIALS[material])
         if instances:
             parts[f"group {k}"] = {"type": "shapegroup", "body": body}
-            body = {
-                "type": "instance", "group": {"type": "ref", "id": f"group {k}"}, "to_world": T().translate(list(center)),
-            }  # fmt: skip
+            group = {"type": "ref", "id": f"group {k}"}
+            body = {"type": "instance", "group": group, "to_world": T().translate(list(center))}
         parts[f"ball {k}"] = body
     return {**parts, **more}
 
@@ -288,6 +294,9 @@ def dome(light: str = "point", eye: str = "perspective", bsdf: dict | None = Non
     lights = {
         **emitters(),
         "point": lambda: {"type": "point", "position": [0.2, 0.3, 0.4], "intensity": rgb(3, 2, 1)},
+        "white": lambda: {
+            "type": "point", "position": [0.2, 0.3, 0.4], "intensity": {"type": "uniform", "value": 2.0},
+        },
         "spot": lambda: {"type": "spot", "to_world": down, "cutoff_angle": 50.0, "intensity": rgb(6, 5, 4)},
         "area": lambda: {
             "type": "rectangle", "to_world": down @ T().translate([0, 0, -0.9]) @ T().scale(0.3),

@@ -151,8 +151,8 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _image(self, part: Pass, trace: TraceConfig) -> mi.TensorXf:
         """Render the image of camera paths and, if there are any, light paths."""
-        image = PathIntegrator._image(self, part, trace)
         lit = None if self.particles is None else self.particles.image(part, trace)
+        image = PathIntegrator._image(self, part, trace)
         return image if lit is None else image + lit
 
     def _camera_view(self, view: Pass) -> Pass:
@@ -162,7 +162,10 @@ class PathReplayIntegrator(PathIntegrator):
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
         """Build the trace configuration of camera paths, without caustics if light paths add these."""
         trace = PathIntegrator._trace_config(self, scene, sensor, state)
-        return trace if self.particles is None else replace(trace, without_caustics=True)
+        if self.particles is None:
+            return trace
+        self.particles.require_no_media(trace)
+        return replace(trace, without_caustics=True)
 
     def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Compute the tangent of the image as the sum of all terms."""

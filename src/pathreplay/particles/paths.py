@@ -143,9 +143,10 @@ def particle_sweep(
     Raises PathreplayError if ``max_depth`` exceeds `deepest`, or if the paths depend on no parameter with gradients.
     """
     if trace.max_depth > deepest(trace):
+        depth = "-1 (unbounded)" if trace.max_depth >= 2**32 - 2 else trace.max_depth + 1
         raise PathreplayError(
-            f"max_depth = {trace.max_depth} is more than the record of a light path can hold ({deepest(trace)}): take "
-            "fewer"
+            f"max_depth = {depth} is more than the record of a light path can hold: take up to {deepest(trace) + 1} "
+            "where light paths are differentiated"
         )
     A = film.adjoint(grad_in) * film.scale(particles.number)
     dr.eval(A)

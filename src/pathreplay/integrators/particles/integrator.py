@@ -85,4 +85,5 @@ class ParticleIntegrator(PathReplayIntegrator):
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
         """Return the configuration of the camera rays, which see emitters directly."""
         trace = PathIntegrator._trace_config(self, scene, sensor, state)
+        self.particles.require_no_media(trace)
         return replace(trace, max_depth=min(trace.max_depth, 1))

@@ -31,6 +31,15 @@ class ParticleTerm:
     max_depth: int  # of the path from emitter to sensor, as in Mitsuba
     caustics: bool  # only the paths that `TraceConfig.without_caustics` omits
 
+    @staticmethod
+    def require_no_media(trace: TraceConfig) -> None:
+        """Raise PathreplayError if the scene has media."""
+        if trace.media is not None:
+            raise PathreplayError(
+                "light paths do not pass through media yet: remove the media from the scene, or trace all paths from "
+                "the sensor"
+            )
+
     def image(self, view: Pass, trace: TraceConfig) -> mi.TensorXf | None:
         """Render the image, with zero alpha; None if no light path starts in the scene."""
         work = self._work(view, trace)
@@ -59,11 +68,6 @@ class ParticleTerm:
         return ""
 
     def _work(self, view: Pass, trace: TraceConfig) -> tuple[TraceConfig, Particles, ParticleFilm] | None:
-        if trace.media is not None:
-            raise PathreplayError(
-                "light paths do not pass through media yet: remove the media from the scene, or trace all paths from "
-                "the sensor"
-            )
         emission = Emission.of(view.scene, view.sensor, self.caustics)
         if emission is None:
             return None
