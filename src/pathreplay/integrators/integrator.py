@@ -381,6 +381,8 @@ class PathReplayIntegrator(PathIntegrator):
         if self.particles is not None and result.moves:
             for note in particle_notes(trace, view.sensor):
                 self._warn_once(note)
+            if not self.particles.caustics:
+                return
         if not result.moves or EDGES in self.warned or self.boundary in ("auto", "all"):
             return
         note, named = missing_edges(trace, view.sensor, self.boundary)
