@@ -26,7 +26,7 @@ KEYS: dict[str, Mapping[str, Any]] = {
         (
             "scene scene_parameters sensors variant integrator integrator.type integrator.max_depth "
             "integrator.rr_depth integrator.hide_emitters integrator.adjoint integrator.jacobian_noise "
-            "integrator.sampling baseline "
+            "integrator.sampling integrator.caustics baseline "
             "parameters parameters.0 parameters.0.key parameters.0.lower parameters.0.upper parameters.0.learning_rate "
             "parameters.0.initial parameters.0.initial.image parameters.0.resolutions parameters.0.refine_at "
             "parameters.0.pose target target.images loss spp eval_spp seed learning_rate final_learning_rate_ratio "

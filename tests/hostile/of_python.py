@@ -61,7 +61,9 @@ OPTIONS = {
         "null_branching",
         "boundary",
         "sampling",
+        "caustics",
     ),
+    "pathreplay_particles": ("max_depth", "rr_depth", "hide_emitters", "samples_per_pass", "attach", "boundary"),
     "dielectric_ad": ("int_ior", "ext_ior", "specular_reflectance", "specular_transmittance"),
     "gridmedium": ("sigma_t", "albedo", "scale", "emission", "supergrid"),
 }

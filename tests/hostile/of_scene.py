@@ -43,7 +43,19 @@ def a_hostile_number_somewhere(room: Room, rng: np.random.Generator) -> Action:
 @recipe(KIND, fuzz=True)
 def a_plugin_of_another_type(room: Room, rng: np.random.Generator) -> Action:
     types = ("perspective", "hdrfilm", "box", "independent", "diffuse", "bitmap", "sphere", "ply", "obj", "constant")
-    others = (*types, "pathreplay", "dielectric_ad", "gridmedium", "merge", "", "../x", "nothing", "path", "aov")
+    others = (
+        *types,
+        "pathreplay",
+        "pathreplay_particles",
+        "dielectric_ad",
+        "gridmedium",
+        "merge",
+        "",
+        "../x",
+        "nothing",
+        "path",
+        "aov",
+    )
     room.edit("ball.xml", f'type="{pick(rng, types)}"', f'type="{pick(rng, others)}"')
     return _either(rng)
 
@@ -252,6 +264,8 @@ PIECES = {
     "two integrators": '<integrator type="path"/><integrator type="prb"/>',
     "a number without a name": '<float value="3"/>',
     "a python expression": '<float name="x" value="__import__(\'os\')"/>',
+    "a thousand lights for light paths": '<integrator type="pathreplay_particles"/>' + '<emitter type="point"/>' * 1000,
+    "light paths without a light": '<integrator type="pathreplay_particles"/>',
     "a thousand lights": '<emitter type="point"/>' * 1000,
 }
 for _name, _xml in PIECES.items():

@@ -125,6 +125,8 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
         {"integrator.adjoint": "replay"},
         {"integrator.attach": "none"},
         {"integrator.hide_emitters": True},
+        {"integrator.caustics": "particles"},
+        {"integrator": {"type": "pathreplay_particles", "max_depth": 3}},
         {"integrator": {"type": "prb", "max_depth": 3}},
     ],
     "derived": [_SHARE],

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-import mitsuba as mi
 import pytest
+from test_particle_gradients import OWN, Mean, in_expectation, mean
 
 from particle_scenes import slab
 from pathreplay.testing.verdict import Z_LIMIT
-from test_particle_gradients import OWN, Mean, in_expectation, mean
 from truth import translate
 
 SEEDS = 12

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -52,7 +51,7 @@ class Emission:
 
     scene: mi.Scene
     sensor: mi.Sensor  # provides the time
-    bounds: tuple[float, ...]  # cumulative probabilities of starting at an emitter
+    weights: tuple[float, ...]  # relative probabilities of starting at an emitter
     maps: tuple[mi.Emitter, ...]  # environment maps
 
     @staticmethod
@@ -70,14 +69,27 @@ class Emission:
             if weight > 0:
                 _require_rays(each)
         maps = tuple(each for each in emitters if each.class_name() == MAP)
-        return Emission(scene, sensor, tuple(sum(weights[: k + 1]) / sum(weights) for k in range(len(weights))), maps)
+        return Emission(scene, sensor, tuple(weights), maps)
 
     def pick(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Return the index of an emitter, a random number that is independent of it, and its probability."""
-        index, low, high = mi.UInt32(0), mi.Float(0), mi.Float(self.bounds[0])
-        for k, (a, b) in enumerate(pairwise(self.bounds)):
-            later = (u >= a) & (b > a)
-            index, low, high = dr.select(later, k + 1, index), dr.select(later, a, low), dr.select(later, b, high)
+        used = [weight for weight in self.weights if weight > 0]
+        if min(used) == max(used):
+            place = u * len(used)
+            index = dr.minimum(mi.UInt32(place), len(used) - 1)
+            again = place - mi.Float(index)
+            for k, weight in enumerate(self.weights):
+                if not weight > 0:
+                    index += dr.select(index >= k, mi.UInt32(1), 0)
+            return index, again, mi.Float(1 / len(used))
+        total = sum(self.weights)
+        index, low, high = mi.UInt32(0), mi.Float(0), mi.Float(0)
+        begin = 0.0
+        for k, weight in enumerate(self.weights):
+            end = begin + weight / total
+            here = (u >= begin) & (end > begin)
+            index, low, high = dr.select(here, k, index), dr.select(here, begin, low), dr.select(here, end, high)
+            begin = end
         return index, (u - low) / (high - low), high - low
 
     def emit(self, trace: TraceConfig, u: EmitterSamples, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
