@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.samplers.sampler import Sampler
+from pathreplay.transport.facts.nodes import is_mesh
 from pathreplay.transport.meet import meet
 from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import Arrival, TraceConfig, reciprocal
@@ -28,6 +29,10 @@ EMITTERS = frozenset(
     }
 )
 MAP = "EnvironmentMapEmitter"
+
+# Largest distance between the origin of a ray and the triangle that emitted it, in units of Mitsuba's offset of origins
+# along normals. Only rays along the triangle have a larger distance; they carry almost no flux.
+CLOSE = 100
 
 
 @dataclass
@@ -53,6 +58,7 @@ class Emission:
     sensor: mi.Sensor  # provides the time
     weights: tuple[float, ...]  # relative probabilities of starting at an emitter
     maps: tuple[mi.Emitter, ...]  # environment maps
+    rounded: tuple[mi.Emitter, ...]  # emissive meshes with interpolated normals
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor, caustics: bool) -> Emission | None:
@@ -69,7 +75,7 @@ class Emission:
             if weight > 0:
                 _require_rays(each)
         maps = tuple(each for each in emitters if each.class_name() == MAP)
-        return Emission(scene, sensor, tuple(weights), maps)
+        return Emission(scene, sensor, tuple(weights), maps, tuple(filter(_has_smooth_mesh, emitters)))
 
     def pick(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Return the index of an emitter, a random number that is independent of it, and its probability."""
@@ -108,12 +114,12 @@ class Emission:
             radius = 0.5 * math.sqrt(sum(float(x) ** 2 for x in box.extents()))
             disk = mi.warp.square_to_uniform_disk_concentric(u.place)
             start = mi.Frame3f(dr.detach(ray.d)).to_world(mi.Vector3f(disk.x, disk.y, 0)) - ray.d
-            on_map = mi.Bool(False)
-            for each in self.maps:
-                on_map |= emitter == mi.EmitterPtr(each)
-            ray.o = dr.select(on_map, mi.Point3f(box.center()) + start * radius, ray.o)
+            ray.o = dr.select(_is_one_of(self.maps, emitter), mi.Point3f(box.center()) + start * radius, ray.o)
         if trace.traits.lights_deform:
             weight *= _growth(trace, emitter, ray, active)
+        if self.rounded:
+            rounded = active & _is_one_of(self.rounded, emitter)
+            weight = dr.select(~rounded | _outwards(trace, emitter, ray, rounded), weight, 0)
         return ray, weight * dr.detach(reciprocal(probability))
 
 
@@ -132,14 +138,45 @@ def _require_rays(emitter: mi.Emitter) -> None:
         )
 
 
-def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-    """Return 1 with the derivative of the log area of the emitting triangle, which Mitsuba omits (see `emitters`)."""
+def _has_smooth_mesh(emitter: mi.Emitter) -> bool:
+    shape = emitter.get_shape()
+    return shape is not None and is_mesh(shape) and shape.has_vertex_normals()
+
+
+def _origin(
+    trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f, mi.Bool]:
+    """Find the triangle that emitted a ray. Returns a hit, the ray to it, and whether a mesh was found."""
     back = mi.Ray3f(dr.detach(ray))
     back.d = -back.d
     hit = trace.scene.ray_intersect_preliminary(back, active=active)
-    on_mesh = active & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == emitter)
+    return hit, back, active & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == emitter)
+
+
+def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+    """Return 1 with the derivative of the log area of the emitting triangle, which Mitsuba omits (see `emitters`)."""
+    hit, back, on_mesh = _origin(trace, emitter, ray, active)
     area = dr.norm(surface_point(hit, back, on_mesh).A)
     return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)
+
+
+def _outwards(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+    """Return whether a ray leaves the outside of the mesh that emits it.
+
+    Mitsuba samples directions around the interpolated normal. Some of them point below the triangle, where the mesh
+    hides them from everything else. As Mitsuba offsets the origins to the outside, such rays would hit the mesh there.
+    """
+    hit, back, on_mesh = _origin(trace, emitter, ray, active)
+    n = hit.compute_surface_interaction(back, mi.RayFlags.All, on_mesh).n
+    reach = CLOSE * mi.math.RayEpsilon * (1 + dr.max(dr.abs(back.o)))
+    return on_mesh & (hit.t < reach) & (dr.dot(n, back.d) < 0)
+
+
+def _is_one_of(emitters: tuple[mi.Emitter, ...], emitter: mi.EmitterPtr) -> mi.Bool:
+    result = mi.Bool(False)
+    for each in emitters:
+        result |= emitter == mi.EmitterPtr(each)
+    return result
 
 
 @dataclass
