@@ -12,7 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from truth import bitmap, rgb
+from truth import bitmap, environment, rgb
 
 HEIGHT, WIDTH = 12, 16
 BLOCK = 4
@@ -83,6 +83,7 @@ def emitters() -> dict[str, Callable[[], dict]]:
             "type": "directional", "direction": [-0.3, -2.6, -0.2], "irradiance": rgb(3, 2.5, 2),
         },
         "envmap": map_of_sky,
+        "sky": lambda: {**map_of_sky(), "bitmap": environment(256)["bitmap"]},
         "constant": lambda: {"type": "constant", "radiance": rgb(0.8, 0.6, 0.5)},
         "projector": lambda: {"type": "projector", "to_world": down, "fov": 50, "irradiance": painted(colours(4, 4))},
     }  # fmt: skip
@@ -169,15 +170,19 @@ def written(mesh: mi.Mesh) -> str:
     return str(path)
 
 
-def perturbed(kind: str, bsdf: dict) -> dict:
-    """A BSDF whose normals a `bumpmap` or `normalmap` perturbs; unchanged for "plain"."""
+def perturbed(kind: str, bsdf: dict, flips: bool = False) -> dict:
+    """A BSDF whose normals a `bumpmap` or `normalmap` perturbs; unchanged for "plain".
+
+    With ``flips``, as by default in Mitsuba, a normal that ``wi`` sees from behind is mirrored.
+    """
+    flip = {"flip_invalid_normals": flips}
     if kind == "bumpmap":
         waves = np.random.default_rng(1).random((8, 8, 1))
-        return {"type": "bumpmap", "arbitrary": bitmap(waves), "scale": 0.5, "bsdf": bsdf}
+        return {"type": "bumpmap", "arbitrary": bitmap(waves), "scale": 0.5, "bsdf": bsdf, **flip}
     if kind == "normalmap":
         n = np.random.default_rng(2).normal(0, 0.3, (8, 8, 3)) + np.array([0, 0, 1])
         n /= np.linalg.norm(n, axis=-1, keepdims=True)
-        return {"type": "normalmap", "normalmap": bitmap(n / 2 + 0.5), "bsdf": bsdf}
+        return {"type": "normalmap", "normalmap": bitmap(n / 2 + 0.5), "bsdf": bsdf, **flip}
     return bsdf
 
 
@@ -321,7 +326,7 @@ def dome(light: str = "point", eye: str = "perspective", bsdf: dict | None = Non
     return {**parts, "sensor": sensor(eye, rfilter, look, **({"focus_distance": 1.4} if eye == "thinlens" else {}))}
 
 
-def plane(light: str, eye: str = "perspective", **more: Any) -> dict:
+def plane(light: str, eye: str = "perspective", bsdf: dict | None = None) -> dict:
     """A textured floor, whose outline is out of view, under a light. A `meter` above the light looks down."""
     T = mi.ScalarTransform4f
     beam = {
@@ -338,10 +343,9 @@ def plane(light: str, eye: str = "perspective", **more: Any) -> dict:
         "light": beam if light == "directionalarea" else emitters()[light](),
         "floor": {
             "type": "rectangle",
-            "to_world": T().rotate([1, 0, 0], -90) @ T().scale(8),
-            "bsdf": {"type": "diffuse", "reflectance": painted(smooth_colours())},
+            "to_world": T().rotate([1, 0, 0], -90) @ T().scale(3),
+            "bsdf": bsdf or {"type": "diffuse", "reflectance": painted(smooth_colours())},
         },
-        **more,
     }
 
 
