@@ -48,9 +48,9 @@ from .scenes.media import ALBEDO, DENSITY, MEDIA_SCENES  # noqa: E402
 
 RESOLUTION, SPP = 32, 16
 WARMUP, RUN = 3, 50
-PATIENCE = 120.0
+PATIENCE = 60.0
 """Processor time in seconds after which a method has no more passes."""
-REFERENCE_SEEDS, REFERENCE_SPP = 8, 256
+REFERENCE_SEEDS = 8
 OURS = "pathreplay"
 
 
@@ -63,6 +63,7 @@ class Row:
     max_depth: int = 64
     rr_depth: int = 5
     rounds: int = 120
+    reference_spp: int = 256
 
     def directions(self, grid: np.ndarray) -> dict[str, tuple[np.ndarray, Stencil, float]]:
         """Return directions in the space of voxels, with the stencil and step of their differences."""
@@ -78,11 +79,11 @@ class Row:
 
 
 ROWS = {
-    "cloud": Row("cloud"),
-    "dense core": Row("dense-core", max_depth=96, rr_depth=97, rounds=50),
+    "cloud": Row("cloud", rounds=150, reference_spp=1024),
+    "dense core": Row("dense-core", max_depth=96, rr_depth=97, rounds=24, reference_spp=64),
     "room with cloud": Row("room-with-cloud", max_depth=32),
     "empty voxels": Row("empty-voxels"),
-    "albedo": Row("cloud-of-albedos", key=ALBEDO),
+    "albedo": Row("cloud-of-albedos", key=ALBEDO, rounds=60),
 }
 
 
@@ -141,7 +142,7 @@ class Problem:
             )
             objective.weigh(self.weights)
             seeds = range(1000, 1000 + REFERENCE_SEEDS)
-            images = (objective.difference(plain, stencil, step, seed, REFERENCE_SPP) for seed in seeds)
+            images = (objective.difference(plain, stencil, step, seed, self.row.reference_spp) for seed in seeds)
             found[name] = np.array([objective.dot(image) for image in images])
             objective.put(mi.Float(0))
         return found
