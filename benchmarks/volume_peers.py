@@ -75,12 +75,12 @@ class Row:
         factor = (grid, WIDE, 0.15)
         if empty.any():
             return {"factor": factor, "empty voxels": (empty, UPWARD, 0.005)}
-        return {"factor": factor, "all voxels": (np.ones_like(grid), WIDE, 0.45 * float(grid.min()))}
+        return {"factor": factor, "all voxels": (np.ones_like(grid), WIDE, 0.2 * float(grid.min()))}
 
 
 ROWS = {
     "cloud": Row("cloud", rounds=150, reference_spp=1024),
-    "dense core": Row("dense-core", max_depth=96, rr_depth=97, rounds=24, reference_spp=64),
+    "dense core": Row("dense-core", max_depth=96, rr_depth=97, rounds=24, reference_spp=96),
     "room with cloud": Row("room-with-cloud", max_depth=32),
     "empty voxels": Row("empty-voxels"),
     "albedo": Row("cloud-of-albedos", key=ALBEDO, rounds=60),
