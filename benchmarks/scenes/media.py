@@ -108,6 +108,12 @@ def _dense_core() -> SceneDict:
     return _medium(cloud_density(32, floor=0.05, width=0.4), depth=40, albedo=0.99, g=0)
 
 
+def _cloud_in_empty_voxels() -> SceneDict:
+    # Three quarters of the voxels are zero, and no others are close to zero.
+    density = cloud_density(32, floor=0)
+    return _medium(np.where(density > 0.1, density, 0), depth=15, albedo=0.9, g=0.3)
+
+
 def _cloud_of_two_albedos() -> SceneDict:
     return _medium(cloud_density(32, floor=0.02), depth=15, albedo=0.85 + 0.04 * np.tanh(_noise(32, 24, 2)), g=0.3)
 
@@ -190,6 +196,7 @@ MEDIA_SCENES: dict[str, Callable[[int], SceneDict]] = {
     "dense-core": partial(_outdoors, _dense_core),
     "room-with-cloud": room_with_cloud,
     "cloud-of-albedos": partial(_outdoors, _cloud_of_two_albedos),
+    "empty-voxels": partial(_outdoors, _cloud_in_empty_voxels),
     "dark-cloud": partial(_outdoors, partial(_cloud, albedo=0.05)),
     "homogeneous": partial(_outdoors, _homogeneous),
     "sealed-fog": sealed_fog,
