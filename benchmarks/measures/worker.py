@@ -29,6 +29,7 @@ MEASURES: dict[Kind, tuple[str, str]] = {
     "gradient": ("passes", "Pass"),
     "image": ("passes", "Pass"),
     "events": ("passes", "Pass"),
+    "light paths": ("light_paths", "LightPass"),
     "truth": ("derivative", "Derivative"),
     "noise": ("replay_error", "ReplayError"),
     "step": ("step", "Step"),
