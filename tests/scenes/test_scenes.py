@@ -32,6 +32,7 @@ KEYS = {
     "shadows": {"body.vertex_positions"},
     "flat-colours": {"camera.to_world"},
     "glass-ball": {"glass.eta", "ball.to_world"},
+    "caustic-lens": {"lens.vertex_positions", "lens.vertex_weight"},
 }
 
 
@@ -41,7 +42,7 @@ def test_builtins_render_with_their_names(name: str) -> None:
     params = mi.traverse(scene)
     assert KEYS[name] <= set(params.keys())
     for sensor in range(len(scene.sensors())):
-        size = (8, 16, 3) if name == "silhouette-in-mirror" else (8, 8, 3)
+        size = {"silhouette-in-mirror": (8, 16, 3), "caustic-lens": (8, 8, 1)}.get(name, (8, 8, 3))
         assert mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict({"type": "volpath"})).shape == size
 
 

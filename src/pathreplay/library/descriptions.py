@@ -64,14 +64,20 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Derived:
-    """A scene parameter that a function computes from other parameters.
+    """A scene parameter that is computed from other parameters.
 
-    Its value is ``function(initial, *inputs)``, where ``initial`` is the value in the scene and ``inputs`` are the
-    values of the parameters named in ``of``.
+    Args:
+        function: its value is ``function(initial, *inputs)``, where ``initial`` is the value in the scene and
+            ``inputs`` are the values of the parameters in ``of``.
+        of: names of the parameters.
+        displace: in place of a function, options of a displacement of ``vertex_positions`` by the height map in ``of``:
+            ``direction``, ``coordinates``, ``interpolation`` and ``weights``, as in a job. ``{}`` displaces along the
+            normals, with texture coordinates.
     """
 
-    function: Callable[..., object] | str
-    of: Sequence[str]
+    function: Callable[..., object] | str | None = None
+    of: Sequence[str] = ()
+    displace: Mapping[str, object] | None = None
 
 
 @dataclass(frozen=True)
@@ -155,9 +161,20 @@ class Objects:
 
     def made(self, derived: Mapping[str, Derived]) -> list[Json]:
         """Convert derived parameters to tables."""
-        return [
-            {"key": key, "function": self.named(each.function), "of": list(each.of)} for key, each in derived.items()
-        ]
+        tables: list[Json] = []
+        for key, each in derived.items():
+            table = {
+                "key": key,
+                "of": list(each.of),
+                "function": None if each.function is None else self.named(each.function),
+                "displace": None if each.displace is None else _plain_table(each.displace),
+            }
+            tables.append({name: value for name, value in table.items() if value is not None})
+        return tables
+
+
+def _plain_table(table: Mapping[str, object]) -> Json:
+    return {name: _plain(value) for name, value in table.items()}
 
 
 def _plain(value: object) -> object:

@@ -128,8 +128,12 @@ class Placing:
     def _known(self, instance: mi.Object, what: str) -> mi.Properties:
         """Describe an existing material or emitter by properties.
 
-        Raises PathreplayError unless the object is a diffuse material or an area light, of constant colour.
+        Raises PathreplayError unless the object is a diffuse material or an area light, of constant colour, or glass.
         """
+        if instance.class_name() == "SmoothDielectric" and mi.traverse(instance).keys() == {"eta"}:
+            properties = mi.Properties("dielectric")
+            properties["int_ior"], properties["ext_ior"] = float(mi.traverse(instance)["eta"]), 1.0
+            return properties
         plugin, part = _KNOWN.get(instance.class_name(), ("", ""))
         params = mi.traverse(instance)
         owner = params.properties[f"{part}.value"][2] if f"{part}.value" in params else None

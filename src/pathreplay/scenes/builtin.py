@@ -8,12 +8,15 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.scenes.bodies import ball, knobs, mesh
+from pathreplay.scenes.caustic_lens import caustic_lens
 from pathreplay.types import SceneDict
 
 COSTS: dict[str, Callable[[int], int]] = {
     "texture": lambda n: 64 * n**2,  # per texel: three numbers, with copies in double precision
     "grid": lambda n: 256 * n**3,  # per voxel: the 12 waves of the noise, all in memory at once
     "views": lambda n: 100_000 * n,  # per view: a sensor with its film
+    "columns": lambda n: 1000 * n**2,  # per vertex, with its faces; rows are about as many
+    "rows": lambda n: 1000 * n**2,
     "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # eight faces, each split into four n times
 }
 """Arguments that determine the size of a scene -> approximate memory in bytes that is needed to build the scene."""
@@ -353,7 +356,7 @@ def _sky(rows: int) -> np.ndarray:
 
 _SCENES = (
     cornell_box, cornell_box_photo, glass_pane, mirror_camera, cloud, silhouettes, silhouette_in_mirror, shadows,
-    flat_colours, glass_ball,
+    flat_colours, glass_ball, caustic_lens,
 )  # fmt: skip
 BUILTINS: dict[str, Callable[..., SceneDict]] = {make.__name__.replace("_", "-"): make for make in _SCENES}
 """Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""

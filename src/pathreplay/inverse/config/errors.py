@@ -30,6 +30,7 @@ _KINDS = {
     "scene_parameters": "a number, true, false or a quoted string",
     "sensors": "the names or numbers of sensors: [0, ...]",
     "test_views": "the names or numbers of sensors: [0, ...]",
+    "direction": "'normal' or three numbers, such as [0, 0, 1]",
     "reference": "the name or number of a sensor",
     "images": "file names, or a pattern such as 'photos/*.png'",
     "masks": "file names, or a pattern such as 'masks/*.png'",
@@ -103,10 +104,10 @@ def _renamed(key: str, table: type[BaseModel]) -> str | None:
     return next((name for name in RENAMED.get(key, "").split() if name in table.model_fields), None)
 
 
-_ALTERNATIVES = ("int", "float", "bool", "str", "count", "ImageValue", "Value", "Displacement")
+_ALTERNATIVES = ("int", "float", "bool", "str", "count", "ImageValue", "Value", "Displacement", "TransportStart")
 
 
 def _path(loc: tuple[int | str, ...]) -> list[str]:
     """Return the location of an error as keys, without pydantic's names of union alternatives."""
-    tried = ("list[", "function-", "constrained-", "nullable[")
+    tried = ("list[", "function-", "constrained-", "nullable[", "literal[")
     return [str(p) for p in loc if p not in _ALTERNATIVES and not str(p).startswith(tried)]

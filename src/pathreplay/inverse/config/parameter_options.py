@@ -55,16 +55,47 @@ class Displacement(Table):
     """Rotation vector in degrees."""
 
 
+class TransportStart(Table):
+    """A height map whose caustic is an image, by optimal transport (`pathreplay.caustic_heights`)."""
+
+    transport: str
+    """Image file, or 'matplotlib:NAME' for a sample image of matplotlib; it is converted to grey."""
+    width: Positive
+    """Width of the exit surface in scene units."""
+    distance: Positive
+    """Distance from the exit surface to the receiver in scene units."""
+    eta: Annotated[Finite, Field(gt=1)]
+    """Index of refraction of the slab relative to its surroundings."""
+    receiver_width: Positive | None = None
+    """Width of the image on the receiver in scene units; default: the width of the exit surface."""
+    source_distance: Positive | None = None
+    """Distance from a point light on the axis to the entry surface; default: collimated light."""
+    thickness: Annotated[Finite, Field(ge=0)] = 0.0
+    """Distance from the entry surface to the exit surface, which matters for a point light only."""
+    floor: Annotated[Finite, Field(gt=0, lt=1)] = 0.02
+    """Fraction of the light that is distributed evenly."""
+    fit: Literal["stretch", "crop"] = "stretch"
+    """'stretch' resamples the image to the shape of the map. 'crop' first crops the image to this aspect ratio."""
+    raw: Switch = False
+    """Use the stored values without decoding them from sRGB."""
+
+
 def _kind_of_initial(value: object) -> str:
+    if isinstance(value, TransportStart) or (isinstance(value, dict) and "transport" in value):
+        return "TransportStart"
     names = list(value) if isinstance(value, dict) else []
     posed = any(difflib.get_close_matches(str(name), Displacement.model_fields, n=1) for name in names)
     return "Displacement" if posed or isinstance(value, Displacement) else "Value"
 
 
 Initial = Annotated[
-    Annotated[Value, Tag("Value")] | Annotated[Displacement, Tag("Displacement")], Discriminator(_kind_of_initial)
+    Annotated[Value, Tag("Value")]
+    | Annotated[Displacement, Tag("Displacement")]
+    | Annotated[TransportStart, Tag("TransportStart")],
+    Discriminator(_kind_of_initial),
 ]
-"""Initial value of a parameter or, for a pose, its initial displacement relative to the scene."""
+"""Initial value of a parameter; for a pose, its initial displacement relative to the scene; for a height map, the image
+of its caustic."""
 
 
 NOT_OF_A_POSE = frozenset(
@@ -86,7 +117,7 @@ class Parameter(Table):
     """Learning rate of this parameter; default: the learning rate of the job."""
     initial: Initial | None = None
     """Initial value: a number, a list (a colour), an image or volume file, or an image table; for a pose, a
-    displacement. Default: the value in the scene."""
+    displacement; for a height map, also the image of its caustic. Default: the value in the scene."""
     resolutions: Annotated[list[Count], Field(min_length=1)] | None = None
     """Resolutions of a texture or volume, coarse to fine, as the number of entries along its longest axis."""
     refine_at: list[Count] | None = None
@@ -183,12 +214,38 @@ class Parameter(Table):
         raise ValueError(f"parameter '{self.key}': {why}")
 
 
+class Displace(Table):
+    """Displacement of the vertices of a mesh by a height map."""
+
+    direction: Literal["normal"] | Vector = "normal"
+    """Direction of positive heights: the normal at each vertex of the mesh in the scene, or a vector."""
+    coordinates: Literal["uv", "xy", "xz", "yx", "yz", "zx", "zy"] = "uv"
+    """Coordinates on the height map: the texture coordinates, or two axes, along which it spans the whole mesh."""
+    interpolation: Literal["linear", "cubic"] = "linear"
+    """Interpolation of the height map: linear, or by cubic B-splines, whose slopes and curvatures are continuous."""
+    weights: str | None = None
+    """Attribute of the mesh, such as 'vertex_weight', whose numbers multiply the heights; default: 1 everywhere."""
+
+
 class Derivation(Table):
-    """A scene parameter, or several that match a glob, computed from other parameters by a user function."""
+    """A scene parameter, or several that match a glob, computed from other parameters."""
 
     key: str
-    """Scene parameter that the function computes, or a glob."""
-    function: ImportPath
+    """Scene parameter that is computed, or a glob."""
+    function: ImportPath | None = None
     """Function as module:function; its arguments are the value in the scene and the parameters in 'of'."""
+    displace: Displace | None = None
+    """Displacement of the vertex_positions of a mesh by the height map in 'of', in place of a function."""
     of: Annotated[list[str], Field(min_length=1)]
     """Parameters of the job, in the order of the function's arguments."""
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Derivation:
+        if (self.function is None) == (self.displace is None):
+            given = "neither 'function' nor 'displace'" if self.function is None else "both 'function' and 'displace'"
+            raise ValueError(f"derived '{self.key}': it has {given}; give one of them")
+        if self.displace is not None and len(self.of) != 1:
+            raise ValueError(
+                f"derived '{self.key}': 'displace' takes one height map, but 'of' names {len(self.of)}; name one"
+            )
+        return self

@@ -16,8 +16,10 @@ This page lists all keys of a job file. It is the output of `pathreplay schema -
 _TITLES = {
     "Parameter": "[[parameters]]",
     "Displacement": "initial = { ... } for a pose",
+    "TransportStart": "initial = { transport = ... }",
     "ImageValue": "{ image = ... }",
     "Derivation": "[[derived]]",
+    "Displace": "displace = { ... }",
     "Target": "[target]",
     "Capture": "[capture]",
     "Exposure": "[exposure]",

@@ -18,7 +18,14 @@ from pathreplay.inverse.config.executor_options import ExecutorName, RayOptions
 from pathreplay.inverse.config.memory_options import Memory, bytes_of
 from pathreplay.inverse.config.noise_options import AUTO, AdaptiveSpp, Spp
 from pathreplay.inverse.config.optimizer_options import Optimizer
-from pathreplay.inverse.config.parameter_options import Derivation, Displacement, ImageValue, Parameter
+from pathreplay.inverse.config.parameter_options import (
+    Derivation,
+    Displace,
+    Displacement,
+    ImageValue,
+    Parameter,
+    TransportStart,
+)
 from pathreplay.inverse.config.parsing import YAML, most_bytes, parsed
 from pathreplay.inverse.config.preview_options import Preview
 from pathreplay.inverse.config.schedules import Schedule
@@ -57,7 +64,7 @@ class Config(Table):
     parameters: Annotated[list[Parameter], Field(min_length=1)]
     """Parameters to recover."""
     derived: list[Derivation] = Field(default_factory=list)
-    """Scene parameters that functions compute from other parameters."""
+    """Scene parameters that are computed from other parameters."""
     capture: Capture | None = None
     """Images with camera poses; the cameras are added to the scene."""
     exposure: Exposure | None = None
@@ -349,6 +356,8 @@ _TABLES: dict[str, type[BaseModel]] = {
     "target": Target,
     "ImageValue": ImageValue,
     "Displacement": Displacement,
+    "TransportStart": TransportStart,
+    "displace": Displace,
     "optimizer": Optimizer,
     "preview": Preview,
     "capture": Capture,

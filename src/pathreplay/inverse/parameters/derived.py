@@ -1,9 +1,10 @@
-"""Derived parameters: scene parameters that a user function computes from variables of the job.
+"""Derived parameters: scene parameters that are computed from variables of the job.
 
     p = f(p₀, a, b, ...),      where p₀ is the value in the scene and a, b, ... are variables
 
 Examples are a mesh whose bending depends on two numbers, one colour for three materials, a camera on a turntable, or
-a texture that a neural network predicts. The function is written in Dr.Jit, and derivatives propagate through it.
+a texture that a neural network predicts. The function is written in Dr.Jit, and derivatives propagate through it. It
+belongs to the user, or is the built-in displacement of a mesh by a height map (`displace`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.parameter_options import Derivation
 from pathreplay.inverse.config.user_functions import Imported, Modules
+from pathreplay.inverse.parameters.displace import displacement_of, require_map
 from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.values import Array, seen
 from pathreplay.inverse.parameters.variables import Variable
@@ -83,20 +85,31 @@ def make_derived(
     The true values of the parameters are not set here.
 
     Raises:
-        PathreplayError: a variable does not exist, or a function cannot be imported, fails, returns an invalid value or
-            does not depend on one of its variables.
+        PathreplayError: a variable does not exist, a function cannot be imported, fails, returns an invalid value or
+            does not depend on one of its variables, or a displacement does not fit its mesh or its height map.
     """
     derived = []
     for key, entry in keys.items():
         arguments = [_named(name, key, keys, params, variables) for name in entry.of]
         form, value = form_of(params, key), seen(params, key)
         # A copy, because `params` holds a reference to the scene's value, which changes during the run.
-        first, function = type(value)(dr.detach(value)), modules.function("Derivation", entry.function, "values")
+        first, function = type(value)(dr.detach(value)), _function(params, key, entry, arguments, modules)
         parameter = Derived(key, function, tuple(entry.of), first, form)
         for k in range(max(len(v.levels.shapes) if v.levels else 1 for v in arguments)):
             _require(parameter, {v.key: v.held(_at_level(v, k)) for v in arguments})
         derived.append(parameter)
     return tuple(derived)
+
+
+def _function(
+    params: mi.SceneParameters, key: str, entry: Derivation, arguments: list[Variable], modules: Modules
+) -> Imported:
+    """Return the function of a derived parameter: one of the user's, or a displacement."""
+    if entry.displace is None:
+        assert entry.function is not None  # see `Derivation`
+        return modules.function("Derivation", entry.function, "values")
+    require_map(key, arguments[0].key, arguments[0].start.shape)
+    return Imported("Derivation", "displace", displacement_of(params, key, entry.displace))
 
 
 def _named(

@@ -9,7 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.parameter_options import ImageValue, Value
+from pathreplay.inverse.caustics.heights import Optics, caustic_heights
+from pathreplay.inverse.config.parameter_options import ImageValue, TransportStart, Value
 from pathreplay.inverse.images.io import Image, find_image, read_image, resized, with_channels
 from pathreplay.inverse.parameters.grids import Array, resampled
 from pathreplay.scenes.parameters import SceneValue, get_array, is_transform
@@ -66,6 +67,37 @@ def make_value(key: str, like: SceneValue, value: Value, base: Path) -> Array:
     image = read_image(find_image(picture.image, base), raw=picture.raw)
     adapted = adapted_image(f"Image '{picture.image}'", image, f"'{key}' has", current.shape[2])
     return resized(adapted, current.shape[0], current.shape[1], crop=picture.fit == "crop")
+
+
+def make_heights(key: str, shape: tuple[int, ...], value: TransportStart, base: Path) -> Array:
+    """Compute a height map whose caustic is an image (see `caustic_heights`).
+
+    Args:
+        key: key of the parameter.
+        shape: shape of the parameter.
+        value: image and optics.
+        base: folder that relative paths start from.
+
+    Raises:
+        PathreplayError: the parameter is not a height map, the image is missing, unreadable or not finite, or no
+            surface refracts the light to it.
+    """
+    if len(shape) != 3 or shape[2] != 1 or min(shape[:2]) < 2:
+        raise PathreplayError(
+            f"Parameter '{key}' of shape {shape} is not a height map, so that 'transport' does not apply; give it the "
+            "shape [rows, columns, 1]"
+        )
+    image = adapted_image(
+        f"Image '{value.transport}'", read_image(find_image(value.transport, base), raw=value.raw), f"'{key}' has", 1
+    )
+    if value.fit == "crop":
+        image = resized(image, shape[0], shape[1], crop=True)
+    names = ("width", "distance", "eta", "receiver_width", "source_distance", "thickness")
+    optics = Optics(**{name: getattr(value, name) for name in names})
+    try:
+        return caustic_heights(image, optics, (shape[0], shape[1]), value.floor)
+    except PathreplayError as error:
+        raise PathreplayError(f"Parameter '{key}': {error}") from None
 
 
 def seen(params: mi.SceneParameters, key: str) -> SceneValue:

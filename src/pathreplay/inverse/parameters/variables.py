@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.parameter_options import Derivation, Displacement, Parameter
+from pathreplay.inverse.config.parameter_options import Derivation, Displacement, Parameter, TransportStart
 from pathreplay.inverse.config.user_functions import Modules
 from pathreplay.inverse.parameters import limits as parameter_limits
 from pathreplay.inverse.parameters.exposures import EXPOSURE
@@ -24,7 +24,7 @@ from pathreplay.inverse.parameters.pose import PART_NAMES, Pose, make_pose
 from pathreplay.inverse.parameters.pyramid import Pyramid
 from pathreplay.inverse.parameters.regularizers import Laplacian, Own, Penalty, Prior, Term, TotalVariation
 from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
-from pathreplay.inverse.parameters.values import Array, make_value, require_finite_array, seen
+from pathreplay.inverse.parameters.values import Array, make_heights, make_value, require_finite_array, seen
 from pathreplay.scenes import parameters
 from pathreplay.scenes.parameters import SceneValue
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
@@ -279,6 +279,8 @@ def _start(key: str, like: SceneValue, form: Form, entry: Parameter, base: Path,
         require_finite_array(f"The initial value of '{key}'", start)
     elif entry.initial is None:
         start = parameters.get_array(like)
+    elif isinstance(entry.initial, TransportStart):
+        start = make_heights(key, parameters.get_array(like).shape, entry.initial, base)
     else:
         assert not isinstance(entry.initial, Displacement)  # the schema allows displacements for poses only
         start = form.of_colours(key, make_value(key, like, entry.initial, base))

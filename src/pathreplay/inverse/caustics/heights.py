@@ -1,0 +1,247 @@
+"""Height map of a lens whose caustic is an image, from optimal transport: the start of caustic design.
+
+Gradients of renderings change a caustic locally, and end in local minima if light has to travel far across the image.
+As in Schwartzburg et al. (2014) and Sun et al. (2024), the start therefore transports the light first:
+
+1. Optimal transport assigns a point T(x) of the receiver to each point x of the exit surface.
+2. Snell's law gives the normal that refracts the light at x to T(x).
+3. The heights are those whose slopes are closest to these normals in the mean square.
+
+Normals of step 2 depend on the heights, so steps 2 and 3 are repeated. Fresnel reflection is ignored.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.interpolate
+import scipy.ndimage
+from numpy.typing import ArrayLike, NDArray
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.caustics.monge_ampere import Field, poisson_solver, potential
+from pathreplay.platform import memory
+
+_A_CELL = 800
+"""Bytes per cell of the height map that the transport takes at its peak."""
+_MARGIN = 1e-9
+"""Width of the border of a triangle that counts as its interior, relative to its size."""
+_ROUNDS = 5
+"""Repetitions of steps 2 and 3, and of step 1 if the light is not collimated."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Arrangement of light, slab and receiver.
+
+    The flat exit surface is the plane z = 0, centred at the origin. Light travels towards positive z, and the receiver
+    is a parallel plane. Lengths are in scene units.
+
+    Args:
+        width: width of the exit surface. Its height follows from the shape of the height map, whose cells are square.
+        distance: distance from the flat exit surface to the receiver.
+        eta: index of refraction of the slab relative to its surroundings.
+        receiver_width: width of the image on the receiver; default: the width of the exit surface.
+        source_distance: distance from a point light on the axis to the flat entry surface; default: collimated light.
+        thickness: distance from the entry surface to the flat exit surface. It only matters for a point light.
+    """
+
+    width: float
+    distance: float
+    eta: float
+    receiver_width: float | None = None
+    source_distance: float | None = None
+    thickness: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("width", "distance", "receiver_width", "source_distance"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise PathreplayError(f"{name} is {value:g}; give a positive length")
+        if not 0 <= self.thickness < np.inf:
+            raise PathreplayError(f"thickness is {self.thickness:g}; give a length of 0 or more")
+        if not 1 < self.eta < np.inf:
+            raise PathreplayError(f"eta is {self.eta:g}; give an index of refraction above 1, such as 1.5 for glass")
+
+    def incidence(self, x: Field, y: Field, z: Field) -> tuple[Field, Field]:
+        """Return the direction of light (..., 3) within the slab at points, and its flux per area of a plane z = const.
+
+        The flux has an arbitrary scale.
+        """
+        if self.source_distance is None:
+            return np.broadcast_to([0.0, 0.0, 1.0], (*x.shape, 3)), np.ones_like(x)
+        s, depth, r = self.source_distance, self.thickness + z, np.hypot(x, y)
+        # Newton's method for the sine of the angle in the slab: r = s tan θ + depth tan θ', sin θ = eta sin θ'. Both
+        # tangents are convex in q, so that the iteration converges from above.
+        q = r / np.hypot(r, s) / self.eta
+        for _ in range(20):
+            outside, inside = np.sqrt(1 - np.square(self.eta * q)), np.sqrt(1 - np.square(q))
+            slope = s * self.eta / outside**3 + depth / inside**3
+            q = q - (s * self.eta * q / outside + depth * q / inside - r) / slope
+        # dΩ / dA = sin θ dθ / (r dr) with cos θ dθ = eta dq and dr = slope dq. On the axis, sin θ / r has a limit.
+        on_axis = 1 / (s + depth / self.eta)
+        ratio = np.where(r > 1e-6 * s, self.eta * q / np.maximum(r, 1e-300), on_axis)
+        flux = ratio * self.eta / (outside * slope)
+        radial = np.where(r > 0, q / np.maximum(r, 1e-300), 0)
+        return np.stack([radial * x, radial * y, inside], axis=-1), flux
+
+
+def caustic_heights(
+    image: ArrayLike, optics: Optics, shape: tuple[int, int] | None = None, floor: float = 0.02
+) -> NDArray[np.float32]:
+    """Compute heights of the exit surface of a slab, whose caustic on the receiver approximates an image.
+
+    Row 0 and column 0 of the heights are at the smallest y and x of the exit surface, and row 0 and column 0 of the
+    image at the smallest y and x of the receiver. The image is therefore upright for a camera that looks along the
+    light, with x to the right and y down.
+
+    Args:
+        image: irradiance (rows, columns), nonnegative; its scale is arbitrary.
+        optics: arrangement of light, slab and receiver.
+        shape: rows and columns of the heights; default: the shape of the image. The image is resampled to this shape.
+        floor: fraction of the light that is distributed evenly. Without it, no continuous surface could leave parts of
+            the image black.
+
+    Returns:
+        Heights of shape (rows, columns, 1) and mean zero, positive towards the receiver.
+
+    Raises:
+        PathreplayError: the image has a wrong shape or values, a light ray would have to be refracted by too large an
+            angle, or the transport does not converge.
+    """
+    density = _density(image, shape, floor)
+    rows, columns = density.shape
+    cell, scale = optics.width / columns, (optics.receiver_width or optics.width) / columns
+    y, x = ((np.arange(n) - (n - 1) / 2) * cell for n in (rows, columns))
+    x, y = np.meshgrid(x, y)
+    h, φ = np.zeros_like(x), np.zeros_like(x)
+    solve = poisson_solver(h.shape)
+    for n in range(_ROUNDS):
+        incoming, flux = optics.incidence(x, y, h)
+        if n == 0 or optics.source_distance is not None:
+            φ = potential(density / _at(flux, *_sources(φ)), φ)
+            to_y, to_x = _receivers(φ)
+        ends = np.stack(
+            [(to_x - (columns - 1) / 2) * scale, (to_y - (rows - 1) / 2) * scale, np.full_like(h, optics.distance)], -1
+        )
+        outgoing = ends - np.stack([x, y, h], -1)
+        outgoing /= np.linalg.norm(outgoing, axis=-1, keepdims=True)
+        _require_possible(np.einsum("...i,...i", incoming, outgoing).min(), optics)
+        # By Snell's law, eta (incoming) - (outgoing) is parallel to the normal.
+        normal = optics.eta * incoming - outgoing
+        h = solve(_divergence(-normal[..., 0] / normal[..., 2], -normal[..., 1] / normal[..., 2]) * cell)
+        h -= h.mean()
+    return h[..., None].astype(np.float32)
+
+
+def _density(image: ArrayLike, shape: tuple[int, int] | None, floor: float) -> Field:
+    """Return the image in another shape, with a mean of 1 and a part ``floor`` that is even."""
+    density = np.asarray(image, np.float64)
+    if density.ndim == 3 and density.shape[2] == 1:
+        density = density[..., 0]
+    if density.ndim != 2 or min(density.shape) < 2:
+        raise PathreplayError(f"The image of the caustic has the shape {density.shape}; give (rows, columns)")
+    if not np.isfinite(density).all() or density.min() < 0 or not density.any():
+        raise PathreplayError(
+            "The image of the caustic is not an irradiance; give finite values, none below 0 and not all 0"
+        )
+    if not 0 < floor < 1:
+        raise PathreplayError(f"floor is {floor:g}; give a fraction between 0 and 1, such as 0.02")
+    cells = math.prod(density.shape if shape is None else shape)
+    memory.require(_A_CELL * cells, f"Transport of light for {cells} heights", "use fewer cells")
+    if shape is not None and tuple(shape) != density.shape:
+        if min(shape) < 2:
+            raise PathreplayError(f"The height map has the shape {tuple(shape)}; give at least two rows and columns")
+        density = _resampled(density, shape)
+    return (1 - floor) * density / density.mean() + floor
+
+
+def _resampled(density: Field, shape: tuple[int, int]) -> Field:
+    """Resample a density to another number of cells; each cell takes the light that falls into it."""
+    for axis, n in enumerate(shape):
+        columns = np.moveaxis(density, axis, 0)
+        total = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
+        borders = np.linspace(0, len(columns), n + 1)
+        at = scipy.interpolate.interp1d(np.arange(len(columns) + 1), total, axis=0)(borders)
+        density = np.moveaxis(np.diff(at, axis=0), 0, axis)
+    return density
+
+
+def _sources(φ: Field, margin: int = 0) -> tuple[Field, Field]:
+    """Return the point S(y) of the exit surface for each cell of the receiver, in cells: rows and columns.
+
+    With a ``margin``, also for cells beyond the border, where S is mirrored.
+    """
+    p = np.pad(φ, margin + 1, mode="symmetric")
+    rows, columns = (np.arange(-margin, n + margin) for n in φ.shape)
+    return rows[:, None] + (p[2:, 1:-1] - p[:-2, 1:-1]) / 2, columns + (p[1:-1, 2:] - p[1:-1, :-2]) / 2
+
+
+def _receivers(φ: Field) -> tuple[Field, Field]:
+    """Return the point T(x) of the receiver for each cell of the exit surface, in cells: the inverse of `_sources`.
+
+    S maps the squares between cells of the receiver to quadrilaterals that cover the exit surface. T is linear in each
+    of their two triangles. (A Delaunay triangulation of the corners takes minutes where S is close to the identity,
+    because the corners of squares lie on circles.)
+    """
+    shape = np.array(φ.shape)
+    points = np.stack(_sources(φ, 1), -1)
+    rows, columns = (np.arange(-1.0, n + 1) for n in φ.shape)
+    ends = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2)
+    index = np.arange(len(ends)).reshape(points.shape[:2])
+    a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel()
+    triangles = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
+    corners = points.reshape(-1, 2)[triangles]
+    # All cells in the bounding box of each triangle, one after another.
+    low = np.clip(np.ceil(corners.min(axis=1)), 0, shape).astype(int)
+    high = np.clip(np.floor(corners.max(axis=1)), -1, shape - 1).astype(int)
+    sides = np.maximum(high - low + 1, 0)
+    counts = sides.prod(axis=1)
+    owner = np.repeat(np.arange(len(triangles)), counts)
+    rank = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    cells = low[owner] + np.stack([rank // sides[owner, 1], rank % sides[owner, 1]], -1)
+    p, q, r = (corners[owner, i] for i in range(3))
+    area = _cross(q - p, r - p)
+    area = np.where(area == 0, np.inf, area)
+    second, third = _cross(cells - p, r - p) / area, _cross(q - p, cells - p) / area
+    weights = np.stack([1 - second - third, second, third], -1)
+    inside = weights.min(axis=1) > -_MARGIN
+    found = np.full((*φ.shape, 2), np.nan)
+    y, x = cells[inside].T
+    found[y, x] = np.einsum("ni,nij->nj", weights[inside], ends[triangles[owner[inside]]])
+    missing = np.isnan(found[..., 0])
+    if missing.any():  # rounding errors beside a triangle without area
+        y, x = scipy.ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
+        found = found[y, x]
+    return found[..., 0], found[..., 1]
+
+
+def _cross(a: Field, b: Field) -> Field:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _at(field: Field, rows: Field, columns: Field) -> Field:
+    return scipy.ndimage.map_coordinates(field, [rows, columns], order=1, mode="nearest")
+
+
+def _divergence(slope_x: Field, slope_y: Field) -> Field:
+    """Return the divergence of slopes at the cells, none of which leave the border: the normal equations."""
+    result = np.zeros_like(slope_x)
+    for axis, slope in enumerate((slope_y, slope_x)):
+        flow, into = np.moveaxis(slope, axis, 0), np.moveaxis(result, axis, 0)
+        between = (flow[1:] + flow[:-1]) / 2
+        into[:-1] += between
+        into[1:] -= between
+    return result
+
+
+def _require_possible(cosine: float, optics: Optics) -> None:
+    """Raise PathreplayError if a ray is turned by more than refraction at the critical angle turns it."""
+    if cosine <= 1 / optics.eta:
+        turn, most = (np.degrees(np.arccos(np.clip(c, -1, 1))) for c in (cosine, 1 / optics.eta))
+        raise PathreplayError(
+            f"The image requires that light turns by {turn:.0f} degrees, but eta = {optics.eta:g} turns it by less "
+            f"than {most:.0f}; enlarge the distance, or reduce the image"
+        )

@@ -1,0 +1,131 @@
+"""A slab that casts a caustic: it is closed before and after its displacement, and the light makes the picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import pathreplay
+from pathreplay.inverse.config.parameter_options import Displace
+from pathreplay.inverse.config.schema import load_config
+from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.inverse.parameters.displace import displacement_of
+from pathreplay.jobs import make_config, optimize
+from pathreplay.output.export import export_run
+from pathreplay.scenes.caustic_lens import caustic_lens, slab
+from pathreplay.scenes.loading import load_scene
+from pathreplay.scenes.parameters import get_array
+
+KEY = "lens.vertex_positions"
+EXAMPLE = Path(__file__).parents[2] / "examples/caustic-lens/config.toml"
+
+
+def volume_if_closed(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Volume of a mesh, of which each edge, by the positions of its ends, is passed once in each direction."""
+    points, places = np.unique(vertices.reshape(-1, 3), axis=0, return_inverse=True)
+    corners = places.ravel()[faces.reshape(-1, 3)]
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    assert (edges[:, 0] != edges[:, 1]).all()
+    there, counts = np.unique(edges, axis=0, return_counts=True)
+    assert (counts == 1).all()
+    np.testing.assert_array_equal(there, np.unique(edges[:, ::-1], axis=0))
+    a, b, c = (points[corners[:, i]].astype(np.float64) for i in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+
+def lens_of(rows: int, columns: int, **options: float) -> tuple[mi.Scene, mi.SceneParameters]:
+    scene = mi.load_dict(caustic_lens(columns, columns, rows, **options))
+    return scene, mi.traverse(scene)
+
+
+def put_heights(params: mi.SceneParameters, heights: np.ndarray) -> None:
+    place = displacement_of(params, KEY, Displace(direction=[0, 0, 1], weights="vertex_weight"))
+    params[KEY] = place(mi.Float(params[KEY]), mi.TensorXf(heights))
+    params.update()
+
+
+def test_the_slab_is_closed_and_flat_where_it_is_not_displaced() -> None:
+    rows, columns, thickness = 5, 8, 0.2
+    params = lens_of(rows, columns)[1]
+    faces = np.array(params["lens.faces"])
+    area = (columns - 1) * (rows - 1) / columns**2  # between the centres of the outer cells
+    assert volume_if_closed(get_array(params[KEY]), faces) == pytest.approx(thickness * area, rel=1e-5)
+    heights = np.random.default_rng(1).uniform(-0.05, 0.05, (rows, columns, 1)).astype(np.float32)
+    rest = get_array(params[KEY]).reshape(-1, 3)
+    put_heights(params, heights)
+    points = get_array(params[KEY]).reshape(-1, 3)
+    normals = get_array(params["lens.vertex_normals"]).reshape(-1, 3)
+    low, upper = rest[:, 2] < 0, rows * columns
+    np.testing.assert_array_equal(points[low], rest[low])
+    assert np.unique(np.round(normals[low], 5), axis=0).shape == (5, 3)  # below and four sides
+    np.testing.assert_allclose(points[:upper, 2], heights.ravel(), atol=1e-6)  # a vertex at each cell
+    assert normals[:upper, 2].min() > 0.2 and np.ptp(normals[:upper, 2]) > 0.05
+    h = heights[..., 0].astype(np.float64)
+    corners = h[:-1, :-1], h[1:, 1:], h[:-1, 1:], h[1:, :-1]
+    mean = np.mean((2 * corners[0] + 2 * corners[1] + corners[2] + corners[3]) / 6)  # of the two triangles of a cell
+    assert volume_if_closed(points.ravel(), faces) == pytest.approx((thickness + mean) * area, rel=1e-4)
+
+
+def picture(rows: int, columns: int) -> np.ndarray:
+    """Another in each corner, so that it shows which way up it is."""
+    v, u = np.meshgrid(*((np.arange(n) + 0.5) / n for n in (rows, columns)), indexing="ij")
+    image = 0.3 + np.exp(-40 * ((u - 0.3) ** 2 + (v - 0.35) ** 2))
+    image[: rows // 4, : columns // 3] = 0.05
+    return image + 0.8 * (abs(u - 0.75) < 0.08) * (v > 0.5)
+
+
+@pytest.mark.parametrize("wide", [1.0, 1.4])
+def test_light_through_the_lens_makes_the_picture(wide: float) -> None:
+    """By Mitsuba's particle tracer, which sees a caustic of collimated light."""
+    rows, columns = 96, 128
+    scene, params = lens_of(rows, columns, receiver_width=wide)
+    image = picture(rows, columns)
+
+    def correlation() -> float:
+        particles = mi.load_dict({"type": "ptracer", "max_depth": 6})
+        found = np.array(mi.render(scene, integrator=particles, spp=256))[..., 0]
+        return float(np.corrcoef(found.ravel(), image.ravel())[0, 1])
+
+    flat = correlation()
+    put_heights(params, pathreplay.caustic_heights(image, pathreplay.Optics(1.0, 1.5, 1.5, receiver_width=wide)))
+    assert correlation() > 0.95
+    assert abs(flat) < 0.5
+
+
+def test_a_run_of_the_example_exports_a_closed_lens(tmp_path: Path) -> None:
+    """With an integrator that computes no caustics, and a coarse map: the start is what is exported."""
+    config = load_config(EXAMPLE).model_dump(mode="json", exclude_unset=True)
+    rows, columns = 25, 20
+    config["scene_parameters"] = {"rows": rows, "columns": columns, "resolution": columns}
+    config["parameters"][0]["shape"] = [rows, columns, 1]
+    (tmp_path / "picture.exr").write_bytes(exr_bytes(picture(rows, columns)[..., None].astype(np.float32)))
+    assert config["target"] == {"images": ["matplotlib:grace_hopper.jpg"]}
+    config["target"] = {"images": [str(tmp_path / "picture.exr")]}
+    config |= {"iterations": 1, "spp": 1, "eval_spp": 1, "output": str(tmp_path / "run"), "loss": "l2"}
+    config["integrator"] = {"type": "pathreplay", "max_depth": 2, "boundary": "none"}
+    result = optimize(make_config(config), progress=False)
+    assert result.parameters["heights"].std() > 0.005
+    export_run(tmp_path / "run")
+    file = tmp_path / "run/export/meshes/lens.ply"
+    written = mi.traverse(mi.load_dict({"type": "ply", "filename": str(file)}))
+    closed = volume_if_closed(get_array(written["vertex_positions"]), np.array(written["faces"]))
+    assert closed == pytest.approx(0.2 * (rows - 1) * (columns - 1) / columns**2, rel=0.02)
+    np.testing.assert_allclose(get_array(written["vertex_positions"]), result.parameters[KEY].ravel(), atol=1e-6)
+    scene = mi.load_file(str(tmp_path / "run/export/scene.xml"))
+    lens = next(shape for shape in scene.shapes() if shape.id() == "lens")
+    assert lens.bsdf().class_name() == "SmoothDielectric"
+    assert mi.traverse(lens.bsdf())["eta"] == pytest.approx(1.5)
+
+
+def test_a_slab_takes_any_material() -> None:
+    made = slab(3, 3, 2.0, 0.5, {"type": "dielectric_ad", "int_ior": 1.4})
+    assert "bsdf.eta" in mi.traverse(made)
+    assert volume_if_closed(get_array(mi.traverse(made)["vertex_positions"]), np.array(mi.traverse(made)["faces"]))
+
+
+def test_a_slab_without_area_is_refused_in_one_line() -> None:
+    with pytest.raises(pathreplay.PathreplayError, match="has 1 rows and 4 columns of vertices; give at least 2"):
+        load_scene("caustic-lens", rows=1, columns=4)
