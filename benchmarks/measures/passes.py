@@ -46,7 +46,7 @@ class Pass(SceneMeasure):
             for key in job.parameters:
                 self.params.set_dirty(key)
             self.params.update()
-        if job.measure not in ("gradient", "light paths", "sum"):
+        if job.measure not in ("gradient", "sum"):
             return [integrator.render(self.scene, seed=seed, spp=job.spp)]
         integrator.render_backward(self.scene, self.params, self.adjoint, seed=seed, spp=job.spp)
         dr.enqueue(dr.ADMode.Backward, [self.params[key] for key in job.parameters])

@@ -30,6 +30,7 @@ MEASURES: dict[Kind, tuple[str, str]] = {
     "image": ("passes", "Pass"),
     "events": ("passes", "Pass"),
     "light paths": ("light_paths", "LightPass"),
+    "caustic": ("caustic", "Caustic"),
     "truth": ("derivative", "Derivative"),
     "noise": ("replay_error", "ReplayError"),
     "step": ("step", "Step"),

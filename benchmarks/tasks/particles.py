@@ -1,17 +1,23 @@
-"""Task `particles`: memory, time and variance of gradients of light paths, relative to plain AD of `ptracer`."""
+"""Task `particles`: gradients of light paths and a caustic design, relative to plain AD of `ptracer`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import statistics as st
+from collections.abc import Iterable, Sequence
 
+import numpy as np
+
+from ..inverse.caustic import CELLS, FLAT, TRANSPORT
+from ..measures.caustic import chosen
 from ..measures.estimates import Estimate, Versus, bias_share, mean_ratio
-from ..measures.job import Job, Point, Record
+from ..measures.job import Curve, Job, Point, Record
+from ..measures.methods import parts
 from ..scenes.caustics import CAUSTIC_ROOM, FLOOR, HEIGHTS, LAMP, LIT_ROOM
 from ..tables import groups, markdown, pooled
 from .depth import fastest, memory_cell, seconds_cell
 
 TITLE = "particles"
-TAKES = (60, 500)
+TAKES = (60, 1400)
 OURS, BASELINE = "particles", "ptracer"
 
 #: Memory: light paths of a pass, as samples per pixel of 50 x 50 pixels.
@@ -24,10 +30,17 @@ CASES = {
     (LIT_ROOM, LAMP): "lamp position",
 }
 DEPTHS, QUICK_DEPTHS = (4, 16, 48), (4,)
+#: Caustic designs: the grid of learning rates (in widths of the slab) and samples per pixel, and processor seconds.
+SMALL, LARGE = CELLS
+RATES, QUICK_RATES = (3e-7, 3e-6, 3e-5), (3e-5,)
+DESIGN_SAMPLES, QUICK_DESIGN_SAMPLES = (4, 32), (4,)
+SECONDS, QUICK_SECONDS = 60.0, 2.0
+#: Fractions of these seconds.
+MOMENTS = (0.1, 0.3, 1.0)
 
 
 def jobs(quick: bool) -> list[Job]:
-    """List the jobs of memory, one for each method, and those of time, in which methods take turns.
+    """List the jobs of memory, one for each method, and those of time and of designs, in which methods take turns.
 
     Each process has one thread. Russian roulette starts beyond the last vertex, so that all paths in the closed rooms
     are as long as ``max_depth`` allows, and because it biases the gradient of `ptracer`.
@@ -51,7 +64,26 @@ def jobs(quick: bool) -> list[Job]:
         for scene, key in CASES
         for depth in (QUICK_DEPTHS if quick else DEPTHS)
     ]
-    return memory + time
+    return memory + time + [_design(start, quick) for start in (TRANSPORT, FLAT)]
+
+
+def _design(start: str, quick: bool) -> Job:
+    return Job(
+        scene=SMALL if quick else LARGE,
+        parameters=(),
+        methods=tuple(f"{method}, {start}" for method in (OURS, BASELINE)),
+        max_depth=0,  # see the problem
+        rr_depth=0,
+        resolution=32 if quick else 128,
+        spp=1,
+        rounds=1,
+        warmup=1,
+        threads=1,
+        measure="caustic",
+        budget=QUICK_SECONDS if quick else SECONDS,
+        rates=QUICK_RATES if quick else RATES,
+        samples=QUICK_DESIGN_SAMPLES if quick else DESIGN_SAMPLES,
+    )
 
 
 def _job(
@@ -75,13 +107,14 @@ def _job(
 
 
 def table(record: Record) -> str:
-    """Format a table of memory, and one of time and variance."""
+    """Format a table of memory, one of time and variance, and one of caustic designs."""
     points = pooled(record.points)
-    sizes = set(SAMPLES.values())
-    memory = [point for point in points if point.paths in sizes]
-    timed = [point for point in points if point.paths not in sizes]
-    parts = [_memory(memory)] if memory else []
-    return "\n\n".join([*parts, *([_time(timed)] if timed else [])])
+    designs = [point for point in points if point.measure == "caustic"]
+    passes = [point for point in points if point.measure != "caustic"]
+    memory = [point for point in passes if point.paths in SAMPLES.values()]
+    timed = [point for point in passes if point.paths not in SAMPLES.values()]
+    tables = ((_memory, memory), (_time, timed), (_designs, designs))
+    return "\n\n".join(formatted(of) for formatted, of in tables if of)
 
 
 def _memory(points: Iterable[Point]) -> str:
@@ -132,3 +165,44 @@ def _cells(of_method: dict[str, Point]) -> list[str]:
 def _brief(estimate: Estimate) -> str:
     """Format an estimate that may span many orders of magnitude."""
     return str(estimate) if estimate.high < 1000 else f"{estimate.value:.1e} [{estimate.low:.1e}, {estimate.high:.1e}]"
+
+
+def _designs(points: Sequence[Point]) -> str:
+    """Format the error of the image by time, for the chosen rate and samples of each start and method."""
+    header = ["start", "method", "rate", "spp", "iterations", "first error"]
+    header += [f"error after {SECONDS * part:g} s" for part in MOMENTS] + [f"{BASELINE} / {OURS}"]
+    return markdown(header, [_design_row(point, points) for point in points])
+
+
+def _design_row(point: Point, points: Sequence[Point]) -> list[str]:
+    method, start = parts(point.method)
+    if point.error or not _runs(point):
+        return [start, method, f"raises: {point.error}", *[""] * (4 + len(MOMENTS))]
+    choice, run = chosen(list(point.curves)), _runs(point)[0]
+    ours = next((other for other in points if other.method == f"{OURS}, {start}" and _runs(other)), None)
+    ratio = "" if ours is None else f"{_last(point) / _last(ours):.2f}"
+    moments = [f"{error_after(run, SECONDS * part):.4f}" for part in MOMENTS]
+    return [
+        start,
+        method,
+        f"{choice.rate:g}",
+        str(choice.spp),
+        str(run.steps[-1]),
+        f"{run.errors[0]:.4f}",
+        *moments,
+        ratio,
+    ]
+
+
+def _runs(point: Point) -> list[Curve]:
+    return [curve for curve in point.curves if not curve.searched]
+
+
+def _last(point: Point) -> float:
+    """Return the median over seeds of the last error."""
+    return st.median(curve.errors[-1] for curve in _runs(point))
+
+
+def error_after(curve: Curve, seconds: float) -> float:
+    """Return the error after a time, linear in time between two measurements; after the last one, that."""
+    return float(np.interp(seconds, curve.seconds, curve.errors))
