@@ -13,6 +13,8 @@ Kind = Literal[
     "gradient",  # a backward pass
     "image",  # a primal one, with the noise of the image
     "events",  # a primal one: the mean number of real events a path
+    "light paths",  # a backward pass, in processor seconds
+    "caustic",  # whole caustic designs: the error of the image against time
     "truth",  # a derivative, to hold against finite differences
     "noise",  # the error of a replay
     "step",  # an optimisation step

@@ -28,7 +28,12 @@ METHODS: dict[str, dict[str, object]] = {
     "sobol": {"type": "pathreplay"},
     "no branch": {"type": "pathreplay", "null_branching": False, "sampling": "scene"},
     "listing": {"type": "prb_volume_listing"},
+    "particles": {"type": "pathreplay_particles"},
+    "ptracer": {"type": "ptracer"},
 }
+
+#: Integrators without an adjoint of their own.
+PLAIN_AD = ("ptracer",)
 
 #: Mitsuba's own: what ours is compared with, and not held to anything when two records are compared.
 STOCK = (
@@ -41,6 +46,7 @@ STOCK = (
     "prbvolpath",
     "volpath",
     "path",
+    "ptracer",
     "finite differences",
     "central difference",
     "half steps",

@@ -29,6 +29,8 @@ MEASURES: dict[Kind, tuple[str, str]] = {
     "gradient": ("passes", "Pass"),
     "image": ("passes", "Pass"),
     "events": ("passes", "Pass"),
+    "light paths": ("light_paths", "LightPass"),
+    "caustic": ("caustic", "Caustic"),
     "truth": ("derivative", "Derivative"),
     "noise": ("replay_error", "ReplayError"),
     "step": ("step", "Step"),
