@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import particle_scenes
-from particle_scenes import balls, blocks, images, meter, perturbed, room, sensor
+from particle_scenes import balls, blocks, emitters, images, meter, perturbed, room, sensor
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
 from truth import rgb
@@ -118,6 +118,16 @@ def test_light_paths_give_the_image_of_path(cell: Cell) -> None:
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.name)
 def test_light_paths_give_the_image_of_path_in_the_long_run(cell: Cell) -> None:
     assert compare_cell(cell, MANY) < Z_LIMIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("weights", [(1.0, 1.0, 1.0), (1.0, 0.3, 2.0), (0.0, 1.0, 1.0)])
+def test_light_paths_start_at_all_emitters(weights: tuple[float, float, float]) -> None:
+    """Neither `path` nor light paths sample an emitter of weight 0."""
+    scene = room("point")
+    for name, weight in zip(("point", "spot", "directional"), weights, strict=True):
+        scene["light" if name == "point" else name] = {**emitters()[name](), "sampling_weight": weight}
+    assert both(f"weights {weights}", mi.load_dict(scene), "pathreplay_particles", (16, 256)) < Z_LIMIT
 
 
 @pytest.mark.slow
