@@ -99,10 +99,11 @@ def methods(drt: Path | None, matching: Path | None) -> dict[str, Callable[[dict
         (factory,) = old_integrators.load(root / "python" / "integrators" / f"{file}.py").values()
         found[name] = lambda limits: old_integrators.integrator(factory, **limits, **options)
 
-    # The options are those of the repositories: `-drt-mis-linear` and `-drt-mis-n4`, `-linear-drt-sd-n4` and `-sd-n4`.
+    # The options are those that the README of sample matching names: `volpathsimple-drt-mis-linear` and
+    # `volpathsimple-drt-mis-n4`, `volpathfm-linear-drt-sd-n4` and `volpathfm-drt-sd-n4`.
     add("ratio tracking, linear", drt, "volpathsimple")
     add("ratio tracking, quadratic", drt, "volpathsimple", use_drt_subsampling=False)
-    four = {"n_samples_transmittance": 4}
+    four = {"n_samples_transmittance": 4, "use_drt_mis": False}
     add("sample matching, linear", matching, "volpathfm_linear_sd", **four)
     add("sample matching, quadratic", matching, "volpathfm_sd", use_drt_subsampling=False, **four)
     return found
