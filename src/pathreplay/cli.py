@@ -132,16 +132,22 @@ def check(
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
     variant: Annotated[str | None, typer.Option(help="Mitsuba variant (default: the best that runs here).")] = None,
     json: Annotated[Path | None, typer.Option(help="Also write results and samples to this JSON file.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Also draw derivative images beside finite differences (PNG, PDF or SVG).")
+    ] = None,
 ) -> None:
     """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if a check fails."""
     with interrupts.undisturbed():  # signals must not interrupt imports; see `optimize`
         from pathreplay.platform import backend
-        from pathreplay.platform.atomic_files import require_writable
+        from pathreplay.platform.atomic_files import require_writable, write_whole
         from pathreplay.scenes.loading import load_scene_for
         from pathreplay.testing import command
 
     if json is not None:
         require_writable(json, "--json")
+    if picture is not None:
+        command.require_picture(picture)
+        require_writable(picture, "--picture")
     with interrupts.undisturbed():
         backend.set_variant(variant)
     loaded, notes = load_scene_for(scene, param)
@@ -156,6 +162,14 @@ def check(
     results = command.print_checks(checks)
     if json is not None:
         command.write_checks(results, json)
+    if picture is not None:
+        from pathreplay.report.derivatives import derivatives_figure
+
+        rows = command.pictured(
+            loaded, [result.key for result in results], integrator=integrator, seeds=seeds, spp=spp, fd_spp=fd_spp,
+            step=step, max_depth=max_depth, boundary=options, sensor=sensor, seed=seed,
+        )  # fmt: skip
+        write_whole(picture, derivatives_figure(rows, command.format_of(picture)), "--picture")
     raise typer.Exit(0 if all(result.passed for result in results) else 1)
 
 

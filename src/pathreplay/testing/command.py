@@ -13,19 +13,23 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from pathreplay.errors import PathreplayError
 from pathreplay.platform.atomic_files import write_whole
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.parameters import resolve_differentiable
 from pathreplay.testing.gradient import GradientCheck, check_gradient
+from pathreplay.testing.picture import derivative_images
 from pathreplay.testing.reference import Spec, integrator_under_test
 
 # Seconds between two progress lines if standard error is not a terminal.
 _PAUSE_S = 10.0
+FORMATS = ("png", "pdf", "svg")
 _STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive": "yellow"}
 
 
@@ -100,6 +104,40 @@ def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
     counts = Counter(result.verdict for result in printed)
     console.print(f"{len(printed)} checked: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.items()))
     return printed
+
+
+def format_of(path: Path) -> str:
+    """Return the format of a picture by the suffix of its name."""
+    return path.suffix.removeprefix(".").lower()
+
+
+def require_picture(path: Path) -> None:
+    """Raise PathreplayError unless the suffix of a picture's name is one of `FORMATS`."""
+    if format_of(path) not in FORMATS:
+        raise PathreplayError(f"--picture is '{path}': give a name that ends in .png, .pdf or .svg")
+
+
+def pictured(
+    scene: mi.Scene,
+    keys: Sequence[str],
+    *,
+    integrator: Spec = None,
+    max_depth: int | None = None,
+    boundary: Mapping[str, object] | None = None,
+    **options: Any,
+) -> list[tuple[str, str, np.ndarray, np.ndarray]]:
+    """Return key, integrator, derivative image and finite differences of each parameter, with progress on stderr.
+
+    Raises the same errors as :func:`derivative_images`.
+    """
+    tested = integrator_under_test(integrator, scene, max_depth, boundary)
+    rows = []
+    with _progress("derivative images") as progress:
+        for i, key in enumerate(keys):
+            progress(i, len(keys))
+            images = derivative_images(scene, key, integrator=tested, **options)
+            rows.append((key, images.integrator, images.gradient, images.reference))
+    return rows
 
 
 def _with_error(value: float, error: float) -> str:

@@ -131,7 +131,7 @@ def check_gradient(  # noqa: PLR0913 (most are keyword-only)
     _require_arguments(scene, sensor, seeds, spp, fd_spp, seed, mode)
     params = traversed(scene)
     tested = integrator_under_test(integrator, scene, max_depth)
-    line = _line(params, key, tested, step, direction, seed)
+    line = line_of(params, key, tested, step, direction, seed)
     plain = reference_integrator(reference, scene, tested)
     plan = _Plan(mode, seeds, spp, fd_spp, seed, progress)
     with alone(params, key):
@@ -193,7 +193,7 @@ class _Plan:
             self.progress(self.done, 1 + 5 * self.seeds)
 
 
-def _line(
+def line_of(
     params: mi.SceneParameters, key: str, by: mi.Integrator, step: float | None, direction: ArrayLike | None, seed: int
 ) -> Line:
     """Choose the line of a check. Raises PathreplayError for a parameter without derivative or in half precision."""
