@@ -26,7 +26,7 @@ WIDTH, DISTANCE, ETA = 1.0, 1.5, 1.5
 LIMITS = {"max_depth": 4, "rr_depth": 5, "hide_emitters": True}
 FLAT, TRANSPORT = "flat start", "transport start"
 #: Samples per pixel of each of the two images from which an error is computed.
-ERROR_SPP = 16
+ERROR_SPP = 32
 SEED = 2**31
 
 #: Cells along each side of the height map, by problem.
