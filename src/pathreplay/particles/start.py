@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.facts.nodes import is_mesh
 from pathreplay.transport.meet import meet
@@ -140,7 +141,7 @@ def _require_rays(emitter: mi.Emitter) -> None:
 
 def _has_smooth_mesh(emitter: mi.Emitter) -> bool:
     shape = emitter.get_shape()
-    return shape is not None and is_mesh(shape) and shape.has_vertex_normals()
+    return shape is not None and is_mesh(shape) and compat.has_normals(shape)
 
 
 def _origin(
@@ -167,7 +168,7 @@ def _outwards(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active:
     hides them from everything else. As Mitsuba offsets the origins to the outside, such rays would hit the mesh there.
     """
     hit, back, on_mesh = _origin(trace, emitter, ray, active)
-    n = hit.compute_surface_interaction(back, mi.RayFlags.All, on_mesh).n
+    n = hit.compute_surface_interaction(back, compat.shading(), on_mesh).n
     reach = CLOSE * mi.math.RayEpsilon * (1 + dr.max(dr.abs(back.o)))
     return on_mesh & (hit.t < reach) & (dr.dot(n, back.d) < 0)
 

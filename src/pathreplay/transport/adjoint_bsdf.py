@@ -37,6 +37,7 @@ def delta_adjoint(v: Vertex, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
 
 
 def _tilt(v: Vertex, wo: mi.Vector3f) -> mi.Float:
-    before = dr.abs(dr.dot(v.n, v.si.wi))
+    n = v.si.to_local(v.si.n) if v.n is None else v.n
+    before = dr.abs(dr.dot(n, v.si.wi))
     lit = before > 0
-    return dr.select(lit, dr.abs(dr.dot(v.n, wo)) * dr.rcp(dr.select(lit, before, 1)), 0)
+    return dr.select(lit, dr.abs(dr.dot(n, wo)) * dr.rcp(dr.select(lit, before, 1)), 0)

@@ -31,7 +31,7 @@ class Vertex:
     origin: mi.Interaction3f  # origin of the rays that leave the vertex
     glow: mi.Spectrum  # radiance emitted towards the ray's origin, MIS weighted
     inside: InMedium = None  # type: ignore[assignment]  # None in scenes without media
-    n: mi.Vector3f = None  # type: ignore[assignment]  # geometric normal in the shading frame, on light paths only
+    n: mi.Vector3f = None  # type: ignore[assignment]  # differentiable geometric normal in the shading frame, on light paths
 
 
 @dataclass

@@ -36,7 +36,6 @@ def choose_step(
     """
     link, ctx = _link(trace), mi.BSDFContext(mi.TransportMode.Importance)
     v = arrive.choose(trace, at, sampler, mi.Spectrum(1), active)
-    v.n = v.si.to_local(v.si.n)
     to = _sight(link, v, u, active)
     lit = active & v.surface & is_smooth(v.bsdf) & to.valid
     if link.caustics:
