@@ -61,15 +61,17 @@ class TransportStart(Table):
     transport: str
     """Image file, or 'matplotlib:NAME' for a sample image of matplotlib; it is converted to grey."""
     width: Positive
-    """Width of the exit surface in scene units."""
+    """Width of the exit surface of a slab, or of a mirror, in scene units."""
     distance: Positive
-    """Distance from the exit surface to the receiver in scene units."""
-    eta: Annotated[Finite, Field(gt=1)]
-    """Index of refraction of the slab relative to its surroundings."""
+    """Distance from this surface to the receiver in scene units."""
+    eta: Annotated[Finite, Field(gt=1)] | None = None
+    """Index of refraction of a slab relative to its surroundings."""
+    mirror_angle: Annotated[Finite, Field(ge=0, lt=90)] | None = None
+    """Angle between the light and the normal of a mirror in degrees, in place of 'eta'."""
     receiver_width: Positive | None = None
-    """Width of the image on the receiver in scene units; default: the width of the exit surface."""
+    """Width of the image on the receiver in scene units; default: the width of the surface."""
     source_distance: Positive | None = None
-    """Distance from a point light on the axis to the entry surface; default: collimated light."""
+    """Distance from a point light to the entry surface, or to the mirror; default: collimated light."""
     thickness: Annotated[Finite, Field(ge=0)] = 0.0
     """Distance from the entry surface to the exit surface, which matters for a point light only."""
     floor: Annotated[Finite, Field(gt=0, lt=1)] = 0.02
