@@ -144,7 +144,14 @@ def test_a_run_of_the_example_exports_a_closed_lens(tmp_path: Path) -> None:
     (tmp_path / "picture.exr").write_bytes(exr_bytes(picture(rows, columns)[..., None].astype(np.float32)))
     assert config["target"] == {"images": ["matplotlib:grace_hopper.jpg"]}
     config["target"] = {"images": [str(tmp_path / "picture.exr")]}
-    config |= {"iterations": 1, "spp": 1, "eval_spp": 1, "output": str(tmp_path / "run"), "loss": "l2"}
+    config |= {
+        "iterations": 1,
+        "warmup_steps": 0,
+        "spp": 1,
+        "eval_spp": 1,
+        "output": str(tmp_path / "run"),
+        "loss": "l2",
+    }
     config["integrator"] = {"type": "pathreplay", "max_depth": 2, "boundary": "none"}
     result = optimize(make_config(config), progress=False)
     assert result.parameters["heights"].std() > 0.005
@@ -169,3 +176,44 @@ def test_a_slab_takes_any_material() -> None:
 def test_a_slab_without_area_is_refused_in_one_line() -> None:
     with pytest.raises(pathreplay.PathreplayError, match="has 1 rows and 4 columns; give at least 2"):
         load_scene("caustic-lens", rows=1, columns=4)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "told"),
+    [
+        (
+            "caustic-lens",
+            {"distance": 0},
+            "Parameter 'distance' of scene 'caustic-lens' is 0; give a number from 0.001",
+        ),
+        ("caustic-lens", {"eta": True}, "Parameter 'eta' of scene 'caustic-lens' is True; give a number from 0.001"),
+        ("caustic-lens", {"source_distance": float("nan")}, "give a number from 0.001 to 1000"),
+        ("caustic-lens", {"two_surfaces": 1}, "'two_surfaces' of scene 'caustic-lens' is 1; give true or false"),
+        ("caustic-lens", {"rows": 4.0}, "Parameter 'rows' of scene 'caustic-lens' is 4.0; give a whole number above 0"),
+        ("caustic-mirror", {"angle": 5}, "The angle of the mirror is 5; give 10 to 80 degrees"),
+        ("caustic-mirror", {"rows": 1, "columns": 4}, "has 1 rows and 4 columns; give at least 2 of each"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_one_line(name: str, arguments: dict[str, Any], told: str) -> None:
+    with pytest.raises(pathreplay.PathreplayError) as caught:
+        load_scene(name, **arguments)
+    assert told in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_frame_lets_only_light_pass_that_reaches_the_exit_surface() -> None:
+    """A flat slab: light of the point is on the receiver within the shadow of the exit surface, and fills it."""
+    columns, source, distance = 16, 2.0, 1.5
+    arguments = {"columns": columns, "rows": columns, "source_distance": source, "distance": distance}
+    scene = mi.load_dict(caustic_lens(64, receiver_width=2.5, **arguments))
+    found = np.array(mi.render(scene, integrator=mi.load_dict({"type": "ptracer", "max_depth": 4}), spp=256))[..., 0]
+    # Behind the slab, light continues in the direction in which it has entered.
+    half = (1 - 1 / columns) / 2
+    sine = np.linspace(0, 0.5, 5001)
+    tangent = sine / np.sqrt(1 - sine**2)
+    reach = source * tangent + 0.2 * (sine / 1.5) / np.sqrt(1 - (sine / 1.5) ** 2)
+    edge = half + distance * np.interp(half, reach, tangent)
+    place = abs((np.arange(64) + 0.5) / 64 - 0.5) * 2.5
+    inside, outside = place < edge - 0.08, place > edge + 0.08
+    lit = found[np.ix_(inside, inside)]
+    assert lit.min() > 0.5 * lit.mean() > 0
+    assert found[outside].max() < 1e-3 * lit.mean() and found[:, outside].max() < 1e-3 * lit.mean()

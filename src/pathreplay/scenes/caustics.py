@@ -12,9 +12,6 @@ from pathreplay.scenes.bodies import mesh
 from pathreplay.types import SceneDict
 
 _WIDTH, _THICKNESS = 1.0, 0.2
-_IRRADIANCE = 3.0
-"""Irradiance of a plane perpendicular to the light; for a point light, at the distance of the lens or mirror."""
-
 _Z = np.array([0.0, 0.0, 1.0])
 _GAP = 1e-4
 """Distance from the black frame to the entry surface of a lens."""
@@ -22,7 +19,7 @@ _GAP = 1e-4
 Array = NDArray[np.floating]
 
 
-def caustic_lens(
+def caustic_lens(  # noqa: PLR0913 (keywords of a job)
     resolution: int = 128,
     columns: int = 128,
     rows: int = 128,
@@ -30,6 +27,7 @@ def caustic_lens(
     eta: float = 1.5,
     receiver_width: float = 1.0,
     source_distance: float | None = None,
+    irradiance: float = 3.0,
     two_surfaces: bool = False,
 ) -> SceneDict:
     """Describe a glass slab between a light and a white receiver, on which the slab casts a caustic.
@@ -37,7 +35,8 @@ def caustic_lens(
     The slab has the width 1 and the thickness 0.2. Its exit surface is in the plane z = 0, and `slab` makes it for a
     height map of ``rows`` x ``columns``. The receiver is at z = ``distance``. Collimated light falls perpendicularly on
     the whole entry surface, or light comes from a point at ``source_distance`` from it. A black frame then stops the
-    light that would miss the exit surface.
+    light that would miss the exit surface. ``irradiance`` is the irradiance of the entry surface; for a point light, at
+    its centre.
 
     The camera sees the part of the receiver that is ``receiver_width`` wide, with x to the right and y down. It stands
     halfway between slab and receiver and hides neither. The key is ``lens.vertex_positions``. The attributes of the
@@ -49,11 +48,11 @@ def caustic_lens(
     scene = _observed(resolution, high, distance, receiver_width, 0.0) | {"lens": lens}
     half = _half(rows, columns)
     if source_distance is None:
-        return scene | {"lamp": _collimated(np.array([0, 0, -2 * _THICKNESS]), _Z, half)}
+        return scene | {"lamp": _collimated(np.array([0, 0, -2 * _THICKNESS]), _Z, half, irradiance)}
     hole = half * min(_at_entry(r, source_distance, eta) / r for r in (*half, np.hypot(*half)))
     frame = _frame(hole, 4 * hole, -_THICKNESS - _GAP)
     origin = np.array([0, 0, -_THICKNESS - source_distance])
-    return scene | {"frame": frame, "lamp": _point(origin, _Z, hole, -_THICKNESS)}
+    return scene | {"frame": frame, "lamp": _point(origin, _Z, hole, -_THICKNESS, irradiance)}
 
 
 def caustic_mirror(
@@ -64,13 +63,15 @@ def caustic_mirror(
     angle: float = 30.0,
     receiver_width: float = 1.0,
     source_distance: float | None = None,
+    irradiance: float = 3.0,
 ) -> SceneDict:
     """Describe a mirror that reflects light onto a white receiver, on which it casts a caustic.
 
     The mirror has the width 1 and faces +z in the plane z = 0. `sheet` makes it for a height map of ``rows`` x
     ``columns``. Light falls on it along (sin α, 0, -cos α), where α is ``angle`` in degrees. It is collimated, or comes
-    from a point at ``source_distance`` from the centre of the mirror. The receiver is parallel to the mirror at
-    z = ``distance``, and is centred where a flat mirror reflects the light of its own centre.
+    from a point at ``source_distance`` from the centre of the mirror. ``irradiance`` is the irradiance of a plane
+    perpendicular to the light, at the centre of the mirror. The receiver is parallel to the mirror at z = ``distance``,
+    and is centred where a flat mirror reflects the light of its own centre.
 
     The camera sees the part of the receiver that is ``receiver_width`` wide, with x to the right and y down. The key is
     ``mirror.vertex_positions``.
@@ -83,10 +84,10 @@ def caustic_mirror(
     scene["mirror"] = sheet(rows, columns, _WIDTH, {"type": "conductor", "material": "none"})
     half = _half(rows, columns)
     if source_distance is not None:
-        return scene | {"lamp": _point(-source_distance * along, along, half, 0.0)}
+        return scene | {"lamp": _point(-source_distance * along, along, half, 0.0, irradiance)}
     # Light falls on all of the mirror wherever it is displaced to, and the lamp is beside the reflected light.
     half = half * [np.cos(α), 1] + 0.1
-    return scene | {"lamp": _collimated(-2 * _WIDTH / np.sin(α) * along, along, half)}
+    return scene | {"lamp": _collimated(-2 * _WIDTH / np.sin(α) * along, along, half, irradiance)}
 
 
 def _observed(resolution: int, high: float, distance: float, receiver_width: float, x: float) -> SceneDict:
@@ -116,17 +117,17 @@ def _half(rows: int, columns: int) -> Array:
     return np.array([columns - 1, rows - 1]) / columns * _WIDTH / 2
 
 
-def _collimated(centre: Array, along: Array, half: Array) -> SceneDict:
+def _collimated(centre: Array, along: Array, half: Array, irradiance: float) -> SceneDict:
     """Describe a rectangle of half width and half height ``half``, which emits light perpendicularly."""
     place = mi.ScalarTransform4f().look_at(origin=centre.tolist(), target=(centre + along).tolist(), up=[0, 1, 0])
     return {
         "type": "rectangle",
         "to_world": place.scale([*half.tolist(), 1]),
-        "emitter": {"type": "directionalarea", "radiance": {"type": "rgb", "value": _IRRADIANCE}},
+        "emitter": {"type": "directionalarea", "radiance": {"type": "rgb", "value": irradiance}},
     }
 
 
-def _point(origin: Array, axis: Array, half: Array, z: float) -> SceneDict:
+def _point(origin: Array, axis: Array, half: Array, z: float, irradiance: float) -> SceneDict:
     """Describe a point light whose cone contains a rectangle around the z axis in a plane z = const."""
     corners = np.array([[x * half[0], y * half[1], z] for x in (-1, 1) for y in (-1, 1)]) - origin
     cosine = corners @ axis / np.linalg.norm(corners, axis=1)
@@ -139,7 +140,7 @@ def _point(origin: Array, axis: Array, half: Array, z: float) -> SceneDict:
         ),
         "beam_width": beam,
         "cutoff_angle": beam + 1,
-        "intensity": {"type": "rgb", "value": float(_IRRADIANCE * distance**2)},
+        "intensity": {"type": "rgb", "value": float(irradiance * distance**2)},
     }
 
 
