@@ -11,11 +11,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.inverse.caustics.heights import Optics, caustic_heights
+from pathreplay.inverse.caustics.heights import caustic_heights
+from pathreplay.inverse.caustics.optics import Optics
 from pathreplay.inverse.config.parameter_options import Displace
 from pathreplay.inverse.parameters.displace import displacement_of
 from pathreplay.inverse.parameters.pyramid import Pyramid
-from pathreplay.scenes.caustic_lens import caustic_lens
+from pathreplay.scenes.caustics import caustic_lens
 
 from ..measures.light_paths import backpropagate
 from ..measures.methods import METHODS

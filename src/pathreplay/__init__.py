@@ -42,7 +42,7 @@ __all__ = [
 _LAZY = {
     "Derived": "pathreplay.library",
     "Iteration": "pathreplay.library",
-    "Optics": "pathreplay.inverse.caustics.heights",
+    "Optics": "pathreplay.inverse.caustics.optics",
     "Parameter": "pathreplay.library",
     "Problem": "pathreplay.library",
     "Result": "pathreplay.library",

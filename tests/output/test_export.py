@@ -56,7 +56,7 @@ def alike(image: np.ndarray, other: np.ndarray) -> float:
 
 SMALL: dict[str, dict[str, int]] = {
     "cornell-box-photo": {"texture": 6}, "glass-pane": {"texture": 6}, "cloud": {"grid": 6, "views": 2},
-    "caustic-lens": {"columns": 6, "rows": 6},
+    "caustic-lens": {"columns": 6, "rows": 6}, "caustic-mirror": {"columns": 6, "rows": 6},
 }  # fmt: skip
 
 

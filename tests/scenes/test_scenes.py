@@ -33,6 +33,7 @@ KEYS = {
     "flat-colours": {"camera.to_world"},
     "glass-ball": {"glass.eta", "ball.to_world"},
     "caustic-lens": {"lens.vertex_positions", "lens.vertex_weight"},
+    "caustic-mirror": {"mirror.vertex_positions"},
 }
 
 
@@ -42,7 +43,9 @@ def test_builtins_render_with_their_names(name: str) -> None:
     params = mi.traverse(scene)
     assert KEYS[name] <= set(params.keys())
     for sensor in range(len(scene.sensors())):
-        size = {"silhouette-in-mirror": (8, 16, 3), "caustic-lens": (8, 8, 1)}.get(name, (8, 8, 3))
+        size = {"silhouette-in-mirror": (8, 16, 3), "caustic-lens": (8, 8, 1), "caustic-mirror": (8, 8, 1)}.get(
+            name, (8, 8, 3)
+        )
         assert mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict({"type": "volpath"})).shape == size
 
 

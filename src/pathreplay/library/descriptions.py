@@ -70,9 +70,9 @@ class Derived:
         function: its value is ``function(initial, *inputs)``, where ``initial`` is the value in the scene and
             ``inputs`` are the values of the parameters in ``of``.
         of: names of the parameters.
-        displace: in place of a function, options of a displacement of ``vertex_positions`` by the height map in ``of``:
-            ``direction``, ``coordinates``, ``interpolation`` and ``weights``, as in a job. ``{}`` displaces along the
-            normals, with texture coordinates.
+        displace: in place of a function, options of a displacement of ``vertex_positions`` by the height maps in
+            ``of``: ``direction``, ``coordinates``, ``interpolation`` and ``weights``, as in a job. ``{}`` displaces
+            along the normals, with texture coordinates.
     """
 
     function: Callable[..., object] | str | None = None

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.scenes.bodies import ball, knobs, mesh
-from pathreplay.scenes.caustic_lens import caustic_lens
+from pathreplay.scenes.caustics import caustic_lens, caustic_mirror
 from pathreplay.types import SceneDict
 
 COSTS: dict[str, Callable[[int], int]] = {
@@ -356,7 +356,7 @@ def _sky(rows: int) -> np.ndarray:
 
 _SCENES = (
     cornell_box, cornell_box_photo, glass_pane, mirror_camera, cloud, silhouettes, silhouette_in_mirror, shadows,
-    flat_colours, glass_ball, caustic_lens,
+    flat_colours, glass_ball, caustic_lens, caustic_mirror,
 )  # fmt: skip
 BUILTINS: dict[str, Callable[..., SceneDict]] = {make.__name__.replace("_", "-"): make for make in _SCENES}
 """Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""

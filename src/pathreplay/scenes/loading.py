@@ -162,11 +162,24 @@ def builtin_dict(name: str, parameters: Mapping[str, object]) -> SceneDict:
         if key not in known:
             raise PathreplayError(f"Built-in scene '{name}' has no parameter '{key}'; it has: {', '.join(known)}")
         what = f"Parameter '{key}' of scene '{name}' is {shown(value)}"
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise PathreplayError(f"{what}; give a whole number above 0")
+        kind = str(known[key].annotation).removesuffix(" | None")
+        if remedy := _remedy(kind, value):
+            raise PathreplayError(f"{what}; give {remedy}")
         if key in COSTS:
+            assert isinstance(value, int)  # by `_remedy`
             memory.require(COSTS[key](value), f"{what} and", "give a smaller number")
     return make(**parameters)
+
+
+def _remedy(kind: str, value: object) -> str:
+    """Return what to give for an argument of a built-in scene; empty if the value is right."""
+    if kind == "bool":
+        return "" if isinstance(value, bool) else "true or false"
+    if kind == "float":
+        given = isinstance(value, int | float) and not isinstance(value, bool) and 1e-3 <= value <= 1e3
+        return "" if given else "a number from 0.001 to 1000"
+    given = isinstance(value, int) and not isinstance(value, bool) and value >= 1
+    return "" if given else "a whole number above 0"
 
 
 def _unknown(spec: str, path: Path) -> str:

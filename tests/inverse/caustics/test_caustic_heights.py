@@ -67,7 +67,17 @@ def irradiance(heights: np.ndarray, optics: Optics, bins: tuple[int, int], side:
     places = (random.random(strata.shape) + strata) / side
     p = np.zeros((*strata.shape[:2], 3))
     weight = np.ones(strata.shape[:2])
-    if optics.source_distance is None:
+    if optics.mirror_angle is not None:
+        # Rays through a part of the plane z = 0 that is larger than the mirror.
+        angle = np.radians(optics.mirror_angle)
+        along = np.array([np.sin(angle), 0.0, -np.cos(angle)])
+        p[..., :2] = (places * cell - half) * 1.2
+        d = np.broadcast_to(along, p.shape)
+        if optics.source_distance is not None:
+            d = p + optics.source_distance * along
+            length = np.linalg.norm(d, axis=-1, keepdims=True)
+            d, weight = d / length, -d[..., 2] / length[..., 0] ** 3
+    elif optics.source_distance is None:
         p[..., :2] = places * cell - half
         d = np.broadcast_to([0.0, 0.0, 1.0], p.shape)
     else:
@@ -81,11 +91,13 @@ def irradiance(heights: np.ndarray, optics: Optics, bins: tuple[int, int], side:
     for _ in range(30):
         p = p + d * ((at(heights, p) - p[..., 2]) / d[..., 2])[..., None]
     n = np.stack([-at(slopes[1], p), -at(slopes[0], p), np.ones(p.shape[:2])], -1)
-    out = refracted(d, n / np.linalg.norm(n, axis=-1, keepdims=True), optics.eta)
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    out = refracted(d, n, optics.eta) if optics.eta else d - 2 * np.sum(d * n, -1, keepdims=True) * n
     q = p + out * ((optics.distance - p[..., 2]) / out[..., 2])[..., None]
-    weight = weight * (np.abs(p[..., :2]) < half).all(-1)
+    centre = optics.distance * np.tan(np.radians(optics.mirror_angle or 0))
+    weight = weight * (np.abs(p[..., :2]) < half - cell / 2).all(-1)
     total = np.histogram2d(
-        q[..., 1].ravel(), q[..., 0].ravel(), bins, [[-high, high], [-wide, wide]], weights=weight.ravel()
+        q[..., 1].ravel(), q[..., 0].ravel() - centre, bins, [[-high, high], [-wide, wide]], weights=weight.ravel()
     )[0]
     return total / total.mean()
 
@@ -103,6 +115,9 @@ OPTICS = {
     "collimated": COLLIMATED,
     "a larger image": Optics(1.0, 2.0, ETA, receiver_width=1.6),
     "a point light": Optics(0.8, 1.2, 1.6, receiver_width=1.0, source_distance=1.5, thickness=0.3),
+    "a mirror": Optics(1.0, 1.5, mirror_angle=30.0),
+    "a mirror at a large angle": Optics(1.0, 2.0, mirror_angle=45.0, receiver_width=0.8),
+    "a mirror and a point light": Optics(0.8, 1.2, mirror_angle=25.0, receiver_width=1.0, source_distance=1.5),
 }
 #: Least correlation with the picture in cells of the surface, and in pixels of four by four cells; the error of the
 #: latter relative to that of a flat surface, whose image is even.
@@ -126,7 +141,9 @@ def test_rays_through_the_surface_give_the_image(picture: str, name: str) -> Non
 
 
 def test_a_flat_surface_is_what_an_even_image_needs() -> None:
-    assert pathreplay.caustic_heights(np.ones((32, 48)), COLLIMATED) == pytest.approx(0, abs=1e-6)
+    """The surface ends at the centres of the outer cells, and so does its shadow."""
+    optics = Optics(1.0, 1.5, ETA, receiver_width=31 / 32)
+    assert pathreplay.caustic_heights(np.ones((32, 32)), optics) == pytest.approx(0, abs=1e-6)
 
 
 def test_each_pixel_takes_its_part_of_the_light() -> None:
@@ -186,20 +203,24 @@ def test_a_job_starts_with_it(tmp_path: Path) -> None:
     assert "so that 'transport' does not apply; give it the shape [rows, columns, 1]" in told(shape=[40, 40, 3])
     assert "unknown key 'parameters.0.initial.wide'; did you mean 'width'?" in told(initial={**start, "wide": 1.0})
     assert "'parameters.0.initial.eta' is 1" in told(initial={**start, "eta": 1.0})
+    assert "Parameter 'heights': The optics have both" in told(initial={**start, "mirror_angle": 30.0})
     assert "No image file" in told(initial={**start, "transport": "pictur.exr"})
 
 
+@pytest.mark.parametrize("aspect", [1.0, 0.7])
 @pytest.mark.parametrize("picture", PICTURES)
-def test_each_point_of_the_surface_has_its_point_of_the_image(picture: str) -> None:
+def test_each_point_of_the_surface_has_its_point_of_the_image(picture: str, aspect: float) -> None:
     """The inverse of the transport is found where corners of cells lie on circles and where cells vanish, too."""
-    φ = potential(PICTURES[picture](40, 56) + 1e-3)
-    rows, columns = _receivers(φ)
+    φ = potential(PICTURES[picture](40, 56) + 1e-3, width=aspect)
+    rows, columns = _receivers(φ, aspect)
     place = [rows + 1, columns + 1]  # with a margin of one cell
-    for coordinate, source in zip(np.indices(φ.shape), _sources(φ, 1), strict=True):
+    for coordinate, source in zip(np.indices(φ.shape), _sources(φ, aspect, 1), strict=True):
         back = scipy.ndimage.map_coordinates(source, place, order=1)
         assert np.abs(back - coordinate).max() < 0.5 and np.sqrt(np.mean((back - coordinate) ** 2)) < 0.03
-    even = _receivers(np.zeros((5, 7)))
-    np.testing.assert_allclose(even, np.indices((5, 7)), atol=1e-12)
+    even = _receivers(np.zeros((5, 7)), aspect)
+    index = np.indices((5, 7))
+    expected = [i * n / (n - 1) - 0.5 for i, n in zip(index, (5, 7), strict=True)]  # all of the image is lit
+    np.testing.assert_allclose(even, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -211,6 +232,11 @@ def test_each_point_of_the_surface_has_its_point_of_the_image(picture: str) -> N
         (np.full((4, 4), np.nan), {}, {}, "is not an irradiance; give finite values"),
         (np.ones((4, 4)), {"eta": 1.0}, {}, "eta is 1; give an index of refraction above 1"),
         (np.ones((4, 4)), {"distance": 0.0}, {}, "distance is 0; give a positive length"),
+        (np.ones((4, 4)), {"eta": None}, {}, "neither eta nor mirror_angle; give eta for a slab of glass, or"),
+        (np.ones((4, 4)), {"mirror_angle": 30.0}, {}, "both eta and mirror_angle; give eta for a slab of glass, or"),
+        (np.ones((4, 4)), {"eta": None, "mirror_angle": 90.0}, {}, "mirror_angle is 90; give an angle"),
+        (np.ones((4, 4)), {"eta": None, "mirror_angle": 9.0, "thickness": 1.0}, {}, "but a mirror has none"),
+        (smooth(32, 32), {"eta": None, "mirror_angle": 45.0, "distance": 0.02}, {}, "turns away from the light"),
         (np.ones((4, 4)), {"thickness": -1.0}, {}, "thickness is -1; give a length of 0 or more"),
         (np.ones((4, 4)), {}, {"floor": 0.0}, "floor is 0; give a fraction between 0 and 1"),
         (np.ones((4, 4)), {}, {"shape": (4, 1)}, "has the shape (4, 1); give at least two rows and columns"),

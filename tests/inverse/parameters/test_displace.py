@@ -161,6 +161,24 @@ def test_attributes_of_the_mesh_are_factors() -> None:
     np.testing.assert_allclose(moved[:, 2], 0.1 * factors, atol=1e-6)
 
 
+def test_several_maps_add_up() -> None:
+    """Each by its own attribute, and of its own size."""
+    write_sheet(Path("sheet.ply"))
+    points, uv = sheet()[0], sheet()[2]
+    random = np.random.default_rng(7)
+    scene = mi.load_file("scene.xml")
+    weights = {f"vertex_{name}": random.uniform(-1, 1, N * N).astype(np.float32) for name in ("first", "second")}
+    for name, values in weights.items():
+        scene.shapes()[0].add_attribute(name, 1, values)
+    params = mi.traverse(scene)
+    place = displacement_of(params, SHEET, Displace(direction=[0, 0, 1], weights=list(weights)))
+    maps = [random.uniform(0, 0.2, shape).astype(np.float32) for shape in ((4, 3, 1), (5, 6, 1))]
+    found = np.array(place(params[SHEET], *map(mi.TensorXf, maps))).reshape(-1, 3)
+    expected = points.copy()
+    expected[:, 2] += sum(w * linear(h[..., 0], *uv.T) for w, h in zip(weights.values(), maps, strict=True))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
 def displaced(points: np.ndarray, faces: np.ndarray, heights: np.ndarray, options: dict[str, Any]) -> np.ndarray:
     """Positions of a mesh without texture coordinates whose faces share no vertex."""
     scene = mi.load_dict({"type": "scene", "body": mesh(points, faces, {"type": "diffuse"})})
@@ -355,7 +373,13 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "both": (changed(function="own:f"), "has both 'function' and 'displace'; give one of them"),
     "neither": (changed(displace=None), "has neither 'function' nor 'displace'; give one of them"),
-    "two maps": (changed(of=["heights", "more"]), "'displace' takes one height map, but 'of' names 2; name one"),
+    "two maps": (changed(of=["heights", "more"]), "'of' names 2 height maps, but displace.weights 1; give a list"),
+    "a map too few": (of(weights=["vertex_other"] * 2), "'of' names 1 height maps, but displace.weights 2; give a"),
+    "no list": (of(weights=[]), "'derived.0.displace.weights'"),
+    "no attribute of two": (
+        changed(of=["heights", "heights"], displace={"coordinates": "xy", "weights": ["vertex_one", "vertex_w"]}),
+        "displace.weights is 'vertex_one', but the mesh has no such attribute",
+    ),
     "an unknown key": (of(along=[0, 0, 1]), "unknown key 'derived.0.displace.along'"),
     "no map": (
         lambda: {**job((3, 3), displace={"coordinates": "xy"}), "parameters": [{"key": "heights", "shape": [9]}]},

@@ -1,1 +1,1 @@
-"""Start of caustic design: optimal transport of light to an image, and the surface that refracts it there."""
+"""Start of caustic design: optimal transport of light to an image, and the surface that directs it there."""

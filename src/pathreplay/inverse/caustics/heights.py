@@ -1,11 +1,14 @@
-"""Height map of a lens whose caustic is an image, from optimal transport: the start of caustic design.
+"""Height map of a lens or mirror whose caustic is an image, from optimal transport: the start of caustic design.
 
 Gradients of renderings change a caustic locally, and end in local minima if light has to travel far across the image.
 As in Schwartzburg et al. (2014) and Sun et al. (2024), the start therefore transports the light first:
 
-1. Optimal transport assigns a point T(x) of the receiver to each point x of the exit surface.
-2. Snell's law gives the normal that refracts the light at x to T(x).
+1. Optimal transport assigns a point T(x) of the receiver to each point x of the surface.
+2. Snell's law or the law of reflection gives the normal that directs the light at x to T(x).
 3. The heights are those whose slopes are closest to these normals in the mean square.
+
+The transport minimises the mean square of the slopes that shift the light, for small slopes. The normals of step 2 are
+then close to those of a surface.
 
 Normals of step 2 depend on the heights, so steps 2 and 3 are repeated. Fresnel reflection is ignored.
 """
@@ -13,7 +16,6 @@ Normals of step 2 depend on the heights, so steps 2 and 3 are repeated. Fresnel 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.interpolate
@@ -22,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.caustics.monge_ampere import Field, poisson_solver, potential
+from pathreplay.inverse.caustics.optics import Optics
 from pathreplay.platform import memory
 
 _A_CELL = 800
@@ -29,77 +32,21 @@ _A_CELL = 800
 _MARGIN = 1e-9
 """Width of the border of a triangle that counts as its interior, relative to its size."""
 _ROUNDS = 5
-"""Repetitions of steps 2 and 3, and of step 1 if the light is not collimated."""
-
-
-@dataclass(frozen=True)
-class Optics:
-    """Arrangement of light, slab and receiver.
-
-    The flat exit surface is the plane z = 0, centred at the origin. Light travels towards positive z, and the receiver
-    is a parallel plane. Lengths are in scene units.
-
-    Args:
-        width: width of the exit surface. Its height follows from the shape of the height map, whose cells are square.
-        distance: distance from the flat exit surface to the receiver.
-        eta: index of refraction of the slab relative to its surroundings.
-        receiver_width: width of the image on the receiver; default: the width of the exit surface.
-        source_distance: distance from a point light on the axis to the flat entry surface; default: collimated light.
-        thickness: distance from the entry surface to the flat exit surface. It only matters for a point light.
-    """
-
-    width: float
-    distance: float
-    eta: float
-    receiver_width: float | None = None
-    source_distance: float | None = None
-    thickness: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("width", "distance", "receiver_width", "source_distance"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                raise PathreplayError(f"{name} is {value:g}; give a positive length")
-        if not 0 <= self.thickness < np.inf:
-            raise PathreplayError(f"thickness is {self.thickness:g}; give a length of 0 or more")
-        if not 1 < self.eta < np.inf:
-            raise PathreplayError(f"eta is {self.eta:g}; give an index of refraction above 1, such as 1.5 for glass")
-
-    def incidence(self, x: Field, y: Field, z: Field) -> tuple[Field, Field]:
-        """Return the direction of light (..., 3) within the slab at points, and its flux per area of a plane z = const.
-
-        The flux has an arbitrary scale.
-        """
-        if self.source_distance is None:
-            return np.broadcast_to([0.0, 0.0, 1.0], (*x.shape, 3)), np.ones_like(x)
-        s, depth, r = self.source_distance, self.thickness + z, np.hypot(x, y)
-        # Newton's method for the sine of the angle in the slab: r = s tan θ + depth tan θ', sin θ = eta sin θ'. Both
-        # tangents are convex in q, so that the iteration converges from above.
-        q = r / np.hypot(r, s) / self.eta
-        for _ in range(20):
-            outside, inside = np.sqrt(1 - np.square(self.eta * q)), np.sqrt(1 - np.square(q))
-            slope = s * self.eta / outside**3 + depth / inside**3
-            q = q - (s * self.eta * q / outside + depth * q / inside - r) / slope
-        # dΩ / dA = sin θ dθ / (r dr) with cos θ dθ = eta dq and dr = slope dq. On the axis, sin θ / r has a limit.
-        on_axis = 1 / (s + depth / self.eta)
-        ratio = np.where(r > 1e-6 * s, self.eta * q / np.maximum(r, 1e-300), on_axis)
-        flux = ratio * self.eta / (outside * slope)
-        radial = np.where(r > 0, q / np.maximum(r, 1e-300), 0)
-        return np.stack([radial * x, radial * y, inside], axis=-1), flux
+"""Repetitions of steps 2 and 3, and of step 1 if the light that a point receives depends on the heights."""
 
 
 def caustic_heights(
     image: ArrayLike, optics: Optics, shape: tuple[int, int] | None = None, floor: float = 0.02
 ) -> NDArray[np.float32]:
-    """Compute heights of the exit surface of a slab, whose caustic on the receiver approximates an image.
+    """Compute heights of the exit surface of a slab, or of a mirror, whose caustic approximates an image.
 
-    Row 0 and column 0 of the heights are at the smallest y and x of the exit surface, and row 0 and column 0 of the
-    image at the smallest y and x of the receiver. The image is therefore upright for a camera that looks along the
-    light, with x to the right and y down.
+    Row 0 and column 0 of the heights are at the smallest y and x of the surface, and row 0 and column 0 of the
+    image at the smallest y and x of the receiver. The image is therefore upright for a camera that looks at the
+    receiver from the side of the surface, with x to the right and y down.
 
     Args:
         image: irradiance (rows, columns), nonnegative; its scale is arbitrary.
-        optics: arrangement of light, slab and receiver.
+        optics: arrangement of light, slab or mirror, and receiver.
         shape: rows and columns of the heights; default: the shape of the image. The image is resampled to this shape.
         floor: fraction of the light that is distributed evenly. Without it, no continuous surface could leave parts of
             the image black.
@@ -117,20 +64,21 @@ def caustic_heights(
     y, x = ((np.arange(n) - (n - 1) / 2) * cell for n in (rows, columns))
     x, y = np.meshgrid(x, y)
     h, φ = np.zeros_like(x), np.zeros_like(x)
-    solve = poisson_solver(h.shape)
+    solve, aspect = poisson_solver(h.shape), optics.foreshortening
     for n in range(_ROUNDS):
         incoming, flux = optics.incidence(x, y, h)
-        if n == 0 or optics.source_distance is not None:
-            φ = potential(density / _at(flux, *_sources(φ)), φ)
-            to_y, to_x = _receivers(φ)
-        ends = np.stack(
-            [(to_x - (columns - 1) / 2) * scale, (to_y - (rows - 1) / 2) * scale, np.full_like(h, optics.distance)], -1
-        )
+        if n == 0 or optics.depends_on_heights:
+            slope_y, slope_x = np.gradient(h, cell)
+            # A surface takes more light of a plane the more it turns to the light.
+            flux = flux * (1 - (incoming[..., 0] * slope_x + incoming[..., 1] * slope_y) / incoming[..., 2])
+            _require_lit(flux)
+            φ = potential(density / _at(flux, *_sources(φ, aspect)), φ, aspect)
+            to_y, to_x = _receivers(φ, aspect)
+        end_x, end_y = optics.centre + (to_x - (columns - 1) / 2) * scale, (to_y - (rows - 1) / 2) * scale
+        ends = np.stack([end_x, end_y, np.full_like(h, optics.distance)], -1)
         outgoing = ends - np.stack([x, y, h], -1)
         outgoing /= np.linalg.norm(outgoing, axis=-1, keepdims=True)
-        _require_possible(np.einsum("...i,...i", incoming, outgoing).min(), optics)
-        # By Snell's law, eta (incoming) - (outgoing) is parallel to the normal.
-        normal = optics.eta * incoming - outgoing
+        normal = optics.normal(incoming, outgoing)
         h = solve(_divergence(-normal[..., 0] / normal[..., 2], -normal[..., 1] / normal[..., 2]) * cell)
         h -= h.mean()
     return h[..., None].astype(np.float32)
@@ -169,25 +117,28 @@ def _resampled(density: Field, shape: tuple[int, int]) -> Field:
     return density
 
 
-def _sources(φ: Field, margin: int = 0) -> tuple[Field, Field]:
-    """Return the point S(y) of the exit surface for each cell of the receiver, in cells: rows and columns.
+def _sources(φ: Field, aspect: float, margin: int = 0) -> tuple[Field, Field]:
+    """Return the point S(y) of the surface for each cell of the receiver, in cells: rows and columns.
 
-    With a ``margin``, also for cells beyond the border, where S is mirrored.
+    S is the gradient of the potential for cells with the width ``aspect`` and the height 1, shrunk to the surface. With
+    a ``margin``, also for cells beyond the border, where S is mirrored.
     """
     p = np.pad(φ, margin + 1, mode="symmetric")
     rows, columns = (np.arange(-margin, n + margin) for n in φ.shape)
-    return rows[:, None] + (p[2:, 1:-1] - p[:-2, 1:-1]) / 2, columns + (p[1:-1, 2:] - p[1:-1, :-2]) / 2
+    y, x = rows[:, None] + (p[2:, 1:-1] - p[:-2, 1:-1]) / 2, columns + (p[1:-1, 2:] - p[1:-1, :-2]) / 2 / aspect**2
+    # The surface ends at the centres of the outer cells.
+    return (y + 0.5) * (1 - 1 / φ.shape[0]), (x + 0.5) * (1 - 1 / φ.shape[1])
 
 
-def _receivers(φ: Field) -> tuple[Field, Field]:
-    """Return the point T(x) of the receiver for each cell of the exit surface, in cells: the inverse of `_sources`.
+def _receivers(φ: Field, aspect: float) -> tuple[Field, Field]:
+    """Return the point T(x) of the receiver for each cell of the surface, in cells: the inverse of `_sources`.
 
     S maps the squares between cells of the receiver to quadrilaterals that cover the exit surface. T is linear in each
     of their two triangles. (A Delaunay triangulation of the corners takes minutes where S is close to the identity,
     because the corners of squares lie on circles.)
     """
     shape = np.array(φ.shape)
-    points = np.stack(_sources(φ, 1), -1)
+    points = np.stack(_sources(φ, aspect, 1), -1)
     rows, columns = (np.arange(-1.0, n + 1) for n in φ.shape)
     ends = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2)
     index = np.arange(len(ends)).reshape(points.shape[:2])
@@ -237,11 +188,10 @@ def _divergence(slope_x: Field, slope_y: Field) -> Field:
     return result
 
 
-def _require_possible(cosine: float, optics: Optics) -> None:
-    """Raise PathreplayError if a ray is turned by more than refraction at the critical angle turns it."""
-    if cosine <= 1 / optics.eta:
-        turn, most = (np.degrees(np.arccos(np.clip(c, -1, 1))) for c in (cosine, 1 / optics.eta))
+def _require_lit(flux: Field) -> None:
+    """Raise PathreplayError if a part of the surface turns away from the light."""
+    if flux.min() <= 0:
         raise PathreplayError(
-            f"The image requires that light turns by {turn:.0f} degrees, but eta = {optics.eta:g} turns it by less "
-            f"than {most:.0f}; enlarge the distance, or reduce the image"
+            "The image requires that a part of the surface turns away from the light; enlarge the distance, reduce the "
+            "image, or reduce mirror_angle"
         )

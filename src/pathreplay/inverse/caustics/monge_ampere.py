@@ -1,4 +1,4 @@
-"""Optimal transport between densities on a rectangle of square cells, by Newton's method on the Monge-Ampère equation.
+"""Optimal transport between densities on a rectangle of cells, by Newton's method on the Monge-Ampère equation.
 
 The map S = ∇v with a convex potential v transports the density g to the uniform density if
 
@@ -36,24 +36,25 @@ _LEAST_DETERMINANT = 0.1
 """Least determinant after a step, relative to the smaller of the determinant before it and g."""
 
 
-def potential(density: Field, initial: Field | None = None) -> Field:
+def potential(density: Field, initial: Field | None = None, width: float = 1.0) -> Field:
     """Solve the Monge-Ampère equation.
 
     Args:
         density: density g per cell, positive; its scale is arbitrary.
         initial: potential of a similar density, from which the iteration starts; default: zero.
+        width: width of a cell, where the height is 1.
 
     Returns:
-        The potential φ per cell, where cells have the side 1.
+        The potential φ per cell.
 
     Raises:
         PathreplayError: the iteration does not converge, because the contrast of the density is too large.
     """
     φ = np.zeros_like(density) if initial is None else initial
     g = density / density.mean()
-    poisson = poisson_solver(g.shape)
+    poisson = poisson_solver(g.shape, width)
     for _ in range(_MOST_STEPS):
-        a, b, c = hessian(φ)
+        a, b, c = hessian(φ, width)
         a, b = 1 + a, 1 + b
         determinant = a * b - c * c
         # The differences do not conserve the integral of the determinant exactly.
@@ -62,12 +63,12 @@ def potential(density: Field, initial: Field | None = None) -> Field:
             return φ
 
         def linearised(δ: Field, a: Field = a, b: Field = b, c: Field = c) -> Field:
-            yy, xx, xy = hessian(δ)
+            yy, xx, xy = hessian(δ, width)
             return _centred(b * yy + a * xx - 2 * c * xy)
 
         residual = _centred(determinant * np.log(wanted / determinant))
         step = _bicgstab(linearised, residual, poisson)
-        factor = _longest(φ, step, _LEAST_DETERMINANT * np.minimum(determinant, wanted))
+        factor = _longest(φ, step, _LEAST_DETERMINANT * np.minimum(determinant, wanted), width)
         if not factor:
             break
         φ = φ + factor * step
@@ -77,20 +78,26 @@ def potential(density: Field, initial: Field | None = None) -> Field:
     )
 
 
-def hessian(φ: Field) -> tuple[Field, Field, Field]:
-    """Return the second differences ∂yy, ∂xx and ∂xy of a field that is mirrored at its border."""
+def hessian(φ: Field, width: float = 1.0) -> tuple[Field, Field, Field]:
+    """Return the second differences ∂yy, ∂xx and ∂xy of a field that is mirrored at its border.
+
+    Cells have this width and the height 1.
+    """
     p = np.pad(φ, 1, mode="edge")
     twice = 2 * φ
     yy = p[2:, 1:-1] - twice + p[:-2, 1:-1]
     xx = p[1:-1, 2:] - twice + p[1:-1, :-2]
     xy = (p[2:, 2:] - p[2:, :-2] - p[:-2, 2:] + p[:-2, :-2]) / 4
-    return yy, xx, xy
+    return yy, xx / width**2, xy / width
 
 
-def poisson_solver(shape: tuple[int, ...]) -> Callable[[Field], Field]:
-    """Return a function that solves ∂yy u + ∂xx u = r - mean(r) for u of mean zero, mirrored at its border."""
+def poisson_solver(shape: tuple[int, ...], width: float = 1.0) -> Callable[[Field], Field]:
+    """Return a function that solves ∂yy u + ∂xx u = r - mean(r) for u of mean zero, mirrored at its border.
+
+    Cells have this width and the height 1.
+    """
     y, x = (2 * np.cos(np.pi * np.arange(n) / n) - 2 for n in shape)
-    eigenvalues = y[:, None] + x
+    eigenvalues = y[:, None] + x / width**2
     eigenvalues[0, 0] = np.inf
 
     def solve(r: Field) -> Field:
@@ -103,11 +110,11 @@ def _centred(field: Field) -> Field:
     return field - field.mean()
 
 
-def _longest(φ: Field, step: Field, least: Field) -> float:
+def _longest(φ: Field, step: Field, least: Field, width: float) -> float:
     """Return the longest factor of a step that keeps v convex, with determinants of at least ``least``; 0 if none."""
     factor = 1.0
     while factor > _SHORTEST:
-        a, b, c = hessian(φ + factor * step)
+        a, b, c = hessian(φ + factor * step, width)
         a, b = 1 + a, 1 + b
         if a.min() > 0 and b.min() > 0 and (a * b - c * c >= least).all():
             return factor

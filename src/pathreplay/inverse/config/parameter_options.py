@@ -61,15 +61,17 @@ class TransportStart(Table):
     transport: str
     """Image file, or 'matplotlib:NAME' for a sample image of matplotlib; it is converted to grey."""
     width: Positive
-    """Width of the exit surface in scene units."""
+    """Width of the exit surface of a slab, or of a mirror, in scene units."""
     distance: Positive
-    """Distance from the exit surface to the receiver in scene units."""
-    eta: Annotated[Finite, Field(gt=1)]
-    """Index of refraction of the slab relative to its surroundings."""
+    """Distance from this surface to the receiver in scene units."""
+    eta: Annotated[Finite, Field(gt=1)] | None = None
+    """Index of refraction of a slab relative to its surroundings."""
+    mirror_angle: Annotated[Finite, Field(ge=0, lt=90)] | None = None
+    """Angle between the light and the normal of a mirror in degrees, in place of 'eta'."""
     receiver_width: Positive | None = None
-    """Width of the image on the receiver in scene units; default: the width of the exit surface."""
+    """Width of the image on the receiver in scene units; default: the width of the surface."""
     source_distance: Positive | None = None
-    """Distance from a point light on the axis to the entry surface; default: collimated light."""
+    """Distance from a point light to the entry surface, or to the mirror; default: collimated light."""
     thickness: Annotated[Finite, Field(ge=0)] = 0.0
     """Distance from the entry surface to the exit surface, which matters for a point light only."""
     floor: Annotated[Finite, Field(gt=0, lt=1)] = 0.02
@@ -215,16 +217,17 @@ class Parameter(Table):
 
 
 class Displace(Table):
-    """Displacement of the vertices of a mesh by a height map."""
+    """Displacement of the vertices of a mesh by height maps."""
 
     direction: Literal["normal"] | Vector = "normal"
     """Direction of positive heights: the normal at each vertex of the mesh in the scene, or a vector."""
     coordinates: Literal["uv", "xy", "xz", "yx", "yz", "zx", "zy"] = "uv"
-    """Coordinates on the height map: the texture coordinates, or two axes, along which it spans the whole mesh."""
+    """Coordinates on the height maps: the texture coordinates, or two axes, along which they span the whole mesh."""
     interpolation: Literal["linear", "cubic"] = "linear"
-    """Interpolation of the height map: linear, or by cubic B-splines, whose slopes and curvatures are continuous."""
-    weights: str | None = None
-    """Attribute of the mesh, such as 'vertex_weight', whose numbers multiply the heights; default: 1 everywhere."""
+    """Interpolation of the height maps: linear, or by cubic B-splines, whose slopes and curvatures are continuous."""
+    weights: str | Annotated[list[str], Field(min_length=1)] | None = None
+    """Attribute of the mesh, such as 'vertex_weight', whose numbers multiply the heights; with several height maps, a
+    list of one attribute for each; default: 1 everywhere."""
 
 
 class Derivation(Table):
@@ -235,7 +238,7 @@ class Derivation(Table):
     function: ImportPath | None = None
     """Function as module:function; its arguments are the value in the scene and the parameters in 'of'."""
     displace: Displace | None = None
-    """Displacement of the vertex_positions of a mesh by the height map in 'of', in place of a function."""
+    """Displacement of the vertex_positions of a mesh by the height maps in 'of', in place of a function."""
     of: Annotated[list[str], Field(min_length=1)]
     """Parameters of the job, in the order of the function's arguments."""
 
@@ -244,8 +247,12 @@ class Derivation(Table):
         if (self.function is None) == (self.displace is None):
             given = "neither 'function' nor 'displace'" if self.function is None else "both 'function' and 'displace'"
             raise ValueError(f"derived '{self.key}': it has {given}; give one of them")
-        if self.displace is not None and len(self.of) != 1:
-            raise ValueError(
-                f"derived '{self.key}': 'displace' takes one height map, but 'of' names {len(self.of)}; name one"
-            )
+        if self.displace is not None:
+            weights = self.displace.weights
+            maps = len(weights) if isinstance(weights, list) else 1
+            if len(self.of) != maps:
+                raise ValueError(
+                    f"derived '{self.key}': 'of' names {len(self.of)} height maps, but displace.weights {maps}; give a "
+                    "list in 'weights' that has one attribute for each map"
+                )
         return self

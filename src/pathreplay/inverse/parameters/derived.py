@@ -4,7 +4,7 @@
 
 Examples are a mesh whose bending depends on two numbers, one colour for three materials, a camera on a turntable, or
 a texture that a neural network predicts. The function is written in Dr.Jit, and derivatives propagate through it. It
-belongs to the user, or is the built-in displacement of a mesh by a height map (`displace`).
+belongs to the user, or is the built-in displacement of a mesh by height maps (`displace`).
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ def _function(
     if entry.displace is None:
         assert entry.function is not None  # see `Derivation`
         return modules.function("Derivation", entry.function, "values")
-    require_map(key, arguments[0].key, arguments[0].start.shape)
+    for argument in arguments:
+        require_map(key, argument.key, argument.start.shape)
     return Imported("Derivation", "displace", displacement_of(params, key, entry.displace))
 
 

@@ -1,9 +1,9 @@
-"""Displacement of a mesh by a height map, a built-in derived parameter.
+"""Displacement of a mesh by height maps, a built-in derived parameter.
 
-    p = p₀ + w h(u, v) d,      where p₀ is the position of a vertex in the scene, (u, v) are its coordinates on the map
-                               h, d is a unit vector and w a factor
+    p = p₀ + Σ w_k h_k(u, v) d,    where p₀ is the position of a vertex in the scene, (u, v) are its coordinates on the
+                                   maps h_k, d is a unit vector and w_k the factor of a map
 
-The position is linear in the entries of the map, so its derivative is exact. Mitsuba recomputes vertex normals from
+The position is linear in the entries of the maps, so its derivative is exact. Mitsuba recomputes vertex normals from
 positions whenever they are set, and derivatives propagate through this computation.
 """
 
@@ -62,8 +62,21 @@ class HeightMap:
         return dr.gather(mi.Float, sums, self.merged)
 
 
-def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> HeightMap:
-    """Make the displacement of a mesh.
+@dataclass(frozen=True)
+class HeightMaps:
+    """Function of the positions p₀ and height maps that returns the sum of the displacements by all of them."""
+
+    maps: tuple[HeightMap, ...]
+
+    def __call__(self, first: mi.Float, *heights: mi.TensorXf) -> mi.Float:
+        """Compute the displaced positions from the positions p₀ and as many height maps as `maps` has (`HeightMap`)."""
+        for place, grid in zip(self.maps, heights, strict=True):
+            first = place(first, grid)
+        return first
+
+
+def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> HeightMaps:
+    """Make the displacement of a mesh, by one height map for each name in ``options.weights``.
 
     Args:
         params: parameters of the scene.
@@ -89,15 +102,20 @@ def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> 
                 "zero, or 'normal'"
             )
         direction = np.broadcast_to(vector / length, positions.shape)
-    factors = _factors(params, key, owner, options.weights, len(positions))
     u, v = _coordinates(params, key, options.coordinates, positions)
-    return HeightMap(
-        mi.Point2f(u, v),
-        mi.Vector3f(*(direction * factors[:, None]).T.astype(np.float32)),
-        None if len(counts) == len(positions) else mi.UInt32(places.astype(np.uint32)),
-        mi.Float((1 / counts[places]).astype(np.float32)),
-        options.interpolation == "cubic",
-    )
+    maps = []
+    for name in options.weights if isinstance(options.weights, list) else [options.weights]:
+        factors = _factors(params, key, owner, name, len(positions))
+        maps.append(
+            HeightMap(
+                mi.Point2f(u, v),
+                mi.Vector3f(*(direction * factors[:, None]).T.astype(np.float32)),
+                None if len(counts) == len(positions) else mi.UInt32(places.astype(np.uint32)),
+                mi.Float((1 / counts[places]).astype(np.float32)),
+                options.interpolation == "cubic",
+            )
+        )
+    return HeightMaps(tuple(maps))
 
 
 def require_map(key: str, name: str, shape: tuple[int, ...]) -> None:

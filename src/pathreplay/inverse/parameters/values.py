@@ -9,7 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.caustics.heights import Optics, caustic_heights
+from pathreplay.inverse.caustics.heights import caustic_heights
+from pathreplay.inverse.caustics.optics import Optics
 from pathreplay.inverse.config.parameter_options import ImageValue, TransportStart, Value
 from pathreplay.inverse.images.io import Image, find_image, read_image, resized, with_channels
 from pathreplay.inverse.parameters.grids import Array, resampled
@@ -92,9 +93,9 @@ def make_heights(key: str, shape: tuple[int, ...], value: TransportStart, base: 
     )
     if value.fit == "crop":
         image = resized(image, shape[0], shape[1], crop=True)
-    names = ("width", "distance", "eta", "receiver_width", "source_distance", "thickness")
-    optics = Optics(**{name: getattr(value, name) for name in names})
+    names = ("width", "distance", "eta", "receiver_width", "source_distance", "thickness", "mirror_angle")
     try:
+        optics = Optics(**{name: getattr(value, name) for name in names})
         return caustic_heights(image, optics, (shape[0], shape[1]), value.floor)
     except PathreplayError as error:
         raise PathreplayError(f"Parameter '{key}': {error}") from None

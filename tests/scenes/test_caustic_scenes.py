@@ -1,8 +1,9 @@
-"""A slab that casts a caustic: it is closed before and after its displacement, and the light makes the picture."""
+"""Slabs and mirrors that cast a caustic: slabs are closed however they are displaced, and light makes the picture."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -15,7 +16,7 @@ from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.inverse.parameters.displace import displacement_of
 from pathreplay.jobs import make_config, optimize
 from pathreplay.output.export import export_run
-from pathreplay.scenes.caustic_lens import caustic_lens, slab
+from pathreplay.scenes.caustics import caustic_lens, caustic_mirror, slab
 from pathreplay.scenes.loading import load_scene
 from pathreplay.scenes.parameters import get_array
 
@@ -41,9 +42,11 @@ def lens_of(rows: int, columns: int, **options: float) -> tuple[mi.Scene, mi.Sce
     return scene, mi.traverse(scene)
 
 
-def put_heights(params: mi.SceneParameters, heights: np.ndarray) -> None:
-    place = displacement_of(params, KEY, Displace(direction=[0, 0, 1], weights="vertex_weight"))
-    params[KEY] = place(mi.Float(params[KEY]), mi.TensorXf(heights))
+def put_heights(
+    params: mi.SceneParameters, heights: np.ndarray, key: str = KEY, weights: str | None = "vertex_weight"
+) -> None:
+    place = displacement_of(params, key, Displace(direction=[0, 0, 1], weights=weights))
+    params[key] = place(mi.Float(params[key]), mi.TensorXf(heights))
     params.update()
 
 
@@ -77,20 +80,57 @@ def picture(rows: int, columns: int) -> np.ndarray:
     return image + 0.8 * (abs(u - 0.75) < 0.08) * (v > 0.5)
 
 
-@pytest.mark.parametrize("wide", [1.0, 1.4])
-def test_light_through_the_lens_makes_the_picture(wide: float) -> None:
+@pytest.mark.parametrize("key", ["vertex_weight", "vertex_entry_weight"])
+def test_both_surfaces_of_a_slab_are_displaced(key: str) -> None:
+    rows, columns, thickness = 5, 8, 0.2
+    params = lens_of(rows, columns, two_surfaces=True)[1]
+    faces = np.array(params["lens.faces"])
+    rest = get_array(params[KEY]).reshape(-1, 3)
+    assert volume_if_closed(rest, faces) == pytest.approx(thickness * (rows - 1) * (columns - 1) / columns**2, rel=1e-5)
+    heights = np.random.default_rng(1).uniform(-0.05, 0.05, (rows, columns, 1)).astype(np.float32)
+    put_heights(params, heights, weights=key)
+    points = get_array(params[KEY]).reshape(-1, 3)
+    moved = rest[:, 2] < 0 if key == "vertex_entry_weight" else rest[:, 2] == 0
+    np.testing.assert_array_equal(points[~moved], rest[~moved])
+    h, change = heights[..., 0], (points - rest)[moved]
+    n = h.size  # the grid of the exit surface is the first, and that of the entry surface the last of the mesh
+    np.testing.assert_allclose(change[-n:, 2] if key == "vertex_entry_weight" else change[:n, 2], h.ravel(), atol=1e-6)
+    normals = get_array(params["lens.vertex_normals"]).reshape(-1, 3)
+    smooth = normals[-n:, 2] if key == "vertex_entry_weight" else normals[:n, 2]
+    assert np.ptp(smooth) > 0.05 and np.abs(smooth).min() > 0.2
+    volume_if_closed(points, faces)
+
+
+SETUPS: dict[str, tuple[Any, dict[str, float], dict[str, float]]] = {
+    "lens": (caustic_lens, {}, {"eta": 1.5}),
+    "wide image": (caustic_lens, {"receiver_width": 1.4}, {"eta": 1.5, "receiver_width": 1.4}),
+    "point light": (caustic_lens, {"source_distance": 2.0}, {"eta": 1.5, "source_distance": 2.0, "thickness": 0.2}),
+    "two surfaces": (caustic_lens, {"two_surfaces": True}, {"eta": 1.5}),
+    "mirror": (caustic_mirror, {"angle": 40.0}, {"mirror_angle": 40.0}),
+    "mirror and point light": (
+        caustic_mirror, {"source_distance": 2.0}, {"mirror_angle": 30.0, "source_distance": 2.0}
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SETUPS)
+def test_light_makes_the_picture(name: str) -> None:
     """By Mitsuba's particle tracer, which sees a caustic of collimated light."""
     rows, columns = 96, 128
-    scene, params = lens_of(rows, columns, receiver_width=wide)
+    make, options, optics = SETUPS[name]
+    scene = mi.load_dict(make(columns, columns, rows, **options))
+    params = mi.traverse(scene)
     image = picture(rows, columns)
 
     def correlation() -> float:
-        particles = mi.load_dict({"type": "ptracer", "max_depth": 6})
+        particles = mi.load_dict({"type": "ptracer", "max_depth": 4})
         found = np.array(mi.render(scene, integrator=particles, spp=256))[..., 0]
         return float(np.corrcoef(found.ravel(), image.ravel())[0, 1])
 
     flat = correlation()
-    put_heights(params, pathreplay.caustic_heights(image, pathreplay.Optics(1.0, 1.5, 1.5, receiver_width=wide)))
+    heights = pathreplay.caustic_heights(image, pathreplay.Optics(1.0, 1.5, **optics))
+    lens = make is caustic_lens
+    put_heights(params, heights, KEY if lens else "mirror.vertex_positions", "vertex_weight" if lens else None)
     assert correlation() > 0.95
     assert abs(flat) < 0.5
 
@@ -104,7 +144,14 @@ def test_a_run_of_the_example_exports_a_closed_lens(tmp_path: Path) -> None:
     (tmp_path / "picture.exr").write_bytes(exr_bytes(picture(rows, columns)[..., None].astype(np.float32)))
     assert config["target"] == {"images": ["matplotlib:grace_hopper.jpg"]}
     config["target"] = {"images": [str(tmp_path / "picture.exr")]}
-    config |= {"iterations": 1, "spp": 1, "eval_spp": 1, "output": str(tmp_path / "run"), "loss": "l2"}
+    config |= {
+        "iterations": 1,
+        "warmup_steps": 0,
+        "spp": 1,
+        "eval_spp": 1,
+        "output": str(tmp_path / "run"),
+        "loss": "l2",
+    }
     config["integrator"] = {"type": "pathreplay", "max_depth": 2, "boundary": "none"}
     result = optimize(make_config(config), progress=False)
     assert result.parameters["heights"].std() > 0.005
@@ -127,5 +174,46 @@ def test_a_slab_takes_any_material() -> None:
 
 
 def test_a_slab_without_area_is_refused_in_one_line() -> None:
-    with pytest.raises(pathreplay.PathreplayError, match="has 1 rows and 4 columns of vertices; give at least 2"):
+    with pytest.raises(pathreplay.PathreplayError, match="has 1 rows and 4 columns; give at least 2"):
         load_scene("caustic-lens", rows=1, columns=4)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "told"),
+    [
+        (
+            "caustic-lens",
+            {"distance": 0},
+            "Parameter 'distance' of scene 'caustic-lens' is 0; give a number from 0.001",
+        ),
+        ("caustic-lens", {"eta": True}, "Parameter 'eta' of scene 'caustic-lens' is True; give a number from 0.001"),
+        ("caustic-lens", {"source_distance": float("nan")}, "give a number from 0.001 to 1000"),
+        ("caustic-lens", {"two_surfaces": 1}, "'two_surfaces' of scene 'caustic-lens' is 1; give true or false"),
+        ("caustic-lens", {"rows": 4.0}, "Parameter 'rows' of scene 'caustic-lens' is 4.0; give a whole number above 0"),
+        ("caustic-mirror", {"angle": 5}, "The angle of the mirror is 5; give 10 to 80 degrees"),
+        ("caustic-mirror", {"rows": 1, "columns": 4}, "has 1 rows and 4 columns; give at least 2 of each"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_one_line(name: str, arguments: dict[str, Any], told: str) -> None:
+    with pytest.raises(pathreplay.PathreplayError) as caught:
+        load_scene(name, **arguments)
+    assert told in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_frame_lets_only_light_pass_that_reaches_the_exit_surface() -> None:
+    """A flat slab: light of the point is on the receiver within the shadow of the exit surface, and fills it."""
+    columns, source, distance = 16, 2.0, 1.5
+    arguments = {"columns": columns, "rows": columns, "source_distance": source, "distance": distance}
+    scene = mi.load_dict(caustic_lens(64, receiver_width=2.5, **arguments))
+    found = np.array(mi.render(scene, integrator=mi.load_dict({"type": "ptracer", "max_depth": 4}), spp=256))[..., 0]
+    # Behind the slab, light continues in the direction in which it has entered.
+    half = (1 - 1 / columns) / 2
+    sine = np.linspace(0, 0.5, 5001)
+    tangent = sine / np.sqrt(1 - sine**2)
+    reach = source * tangent + 0.2 * (sine / 1.5) / np.sqrt(1 - (sine / 1.5) ** 2)
+    edge = half + distance * np.interp(half, reach, tangent)
+    place = abs((np.arange(64) + 0.5) / 64 - 0.5) * 2.5
+    inside, outside = place < edge - 0.08, place > edge + 0.08
+    lit = found[np.ix_(inside, inside)]
+    assert lit.min() > 0.5 * lit.mean() > 0
+    assert found[outside].max() < 1e-3 * lit.mean() and found[:, outside].max() < 1e-3 * lit.mean()
