@@ -11,6 +11,7 @@ from pathreplay.adjoint.autodiff import NonFiniteCounter, Unreached
 from pathreplay.adjoint.baseline import Baseline
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film.image import picture_shape
 from pathreplay.integrators.term import TermResult
 from pathreplay.particles.film import ParticleFilm
 from pathreplay.particles.paths import Particles, link_of, particle_image, particle_sweep, particle_tangent
@@ -49,7 +50,7 @@ class ParticleTerm:
         """Compute the tangent of the image: see `Term`."""
         work, lost = self._work(view, trace), NonFiniteCounter()
         if work is None:
-            return TermResult()
+            return TermResult(dr.zeros(mi.TensorXf, picture_shape(view.sensor)))
         image, moves = particle_tangent(*work, lost)
         dr.eval(image)
         return self._result(work[1], lost, moves, image)
