@@ -17,7 +17,7 @@ from ..tables import groups, markdown, pooled
 from .depth import fastest, memory_cell, seconds_cell
 
 TITLE = "particles"
-TAKES = (60, 1400)
+TAKES = (60, 2700)
 OURS, BASELINE = "particles", "ptracer"
 
 #: Memory: light paths of a pass, as samples per pixel of 50 x 50 pixels.
