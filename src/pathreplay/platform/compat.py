@@ -16,7 +16,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -31,6 +31,7 @@ _FACES = "faces"
 _SHADING = "Default"  # the flag of 3.10
 _FROM_FIELDS = "from_fields"  # the method of 3.10 that fills a mesh
 _PREFIXES = "vertex_", "face_"
+_SPACE = 64  # numbers behind the values of an array
 _OTHERS = _FACES, "bsdf_index", "position_index", "normal_index"
 
 
@@ -211,6 +212,17 @@ def has_normals(mesh: mi.Mesh) -> bool:
     return bool(getattr(mesh, name)())
 
 
+def _with_space(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values in memory that continues behind them.
+
+    Dr.Jit uses the memory of a NumPy array in place. On LLVM it reads whole packets of numbers, also beyond the end,
+    which ends the process if the array ends with a page of memory.
+    """
+    result = np.zeros(values.size + _SPACE, values.dtype)
+    result[: values.size] = values
+    return result[: values.size]
+
+
 def new_mesh(
     vertices: NDArray[np.floating],
     faces: NDArray[np.integer],
@@ -240,8 +252,8 @@ def new_mesh(
     )
     params = mi.traverse(mesh)
     if texcoords is not None:
-        params[TEXCOORDS[0]] = texcoords.astype(np.float32).ravel()
-    params[POSITIONS[0]] = points.ravel()
-    params[_FACES] = corners.ravel()
+        params[TEXCOORDS[0]] = mi.Float(_with_space(texcoords.astype(np.float32).ravel()))
+    params[POSITIONS[0]] = mi.Float(_with_space(points.ravel()))
+    params[_FACES] = mi.UInt32(_with_space(corners.ravel()))
     params.update()
     return mesh
