@@ -75,7 +75,7 @@ SLOW, SLAB = {"step": 1e-3}, {"depth": 4, "step": 1e-3}
 ONCE = {"depth": 2, "step": 1e-3}
 """Of what moves a vertex from which a smooth lobe continues: random directions there are fixed differently."""
 CELLS = (
-    cell("heights, mirror", mirror, "mirror.vertex_positions", waves, spp=2048, **SLOW),
+    cell("heights, mirror", mirror, "mirror.vertex_positions", waves, step=1e-2),
     cell("heights, slab", slab, "top.vertex_positions", waves, spp=2048, **SLAB),
     cell("receiver, mirror", mirror, "ceiling.to_world", POSE, **SLOW),
     cell("receiver, slab", slab, "floor.to_world", POSE, **SLAB),
@@ -98,7 +98,7 @@ CELLS = (
     cell("area", partial(dome, "area"), "light.to_world", POSE, **ONCE),
     cell("projector", partial(dome, "projector"), "light.to_world", translate(0.3, 0.5, 0.7), **ONCE),
     cell("directional", partial(plane, "directional", bsdf=ROUGH), "light.to_world", rotate(0.3, 0.5, 0.7), **ONCE),
-    cell("beam", partial(plane, "directionalarea"), "light.to_world", POSE, **ONCE),
+    cell("beam", partial(plane, "directionalarea"), "light.to_world", POSE, depth=2, step=3e-3),
     cell("intensity", dome, "light.intensity.value", add([0.5, 1.0, 0.2]), step=0.1),
     cell("power", partial(dome, "white"), "light.intensity.value", scale, step=0.1),
     cell("radiance", partial(dome, "area"), "light.emitter.radiance.value", scale, step=0.1, depth=2),
@@ -143,7 +143,7 @@ def same_seed(cell: Cell, spp: int) -> tuple[float, float]:
         steady = integrator(cell, rr_depth=1000)  # probabilities of survival would move
         difference = objective.difference(steady, CENTRAL, cell.step, 1, spp)
         gradient = objective.backward(steady, 1, spp)
-        transpose = objective.transpose_error(steady, steady, 1, max(spp // 4, 16))  # rounding grows with samples
+        transpose = objective.transpose_error(steady, steady, 1, spp)
     size = objective.dot(np.abs(difference))
     error = abs(gradient - objective.dot(difference)) / size
     print(f"{cell.name:20s} depth {cell.depth:2d} {gradient:+12.5e} of {size:11.5e} {error:9.1e} {transpose:9.1e}")
@@ -152,7 +152,7 @@ def same_seed(cell: Cell, spp: int) -> tuple[float, float]:
 
 @pytest.mark.parametrize("name", QUICK)
 def test_gradients_are_differences_with_equal_numbers(name: str) -> None:
-    error, transpose = same_seed(BY_NAME[name], 256)
+    error, transpose = same_seed(BY_NAME[name], 128)
     assert error < SAME_SEED_MAX and transpose < TRANSPOSE_MAX
 
 
@@ -205,7 +205,7 @@ MEANS = (
     mean("spot, mirror", mirror, "light.to_world", translate(0.3, 0, 0.1), depth=4, **OWN),
     mean("receiver, slab", slab, "floor.to_world", POSE, depth=6, **OWN),
     mean("receiver", dome, "dome.to_world", POSE, depth=4),
-    mean("thin lens", partial(dome, eye="thinlens"), "sensor.to_world", POSE, depth=4),
+    mean("thin lens", partial(dome, eye="thinlens"), "sensor.to_world", translate(0, 1, 0), depth=4),
     mean("point", dome, "light.position", add([0.3, 0.5, 0.7]), depth=4),
     mean("point, rough", partial(dome, bsdf=ROUGH), "light.position", add([0.3, 0.5, 0.7]), depth=4),
     mean("spot", partial(dome, "spot"), "light.to_world", POSE, depth=4),
@@ -249,9 +249,6 @@ def test_mean_gradients_are_mean_differences(cell: Mean) -> None:
 # ------------------------------ Edges ------------------------------
 
 
-EDGE_SEEDS = 12
-
-
 def with_ball(center: list[float], radius: float, bsdf: dict, **parts: dict) -> dict:
     """The slab that casts a caustic, and a ball."""
     ball = {"type": "sphere", "center": center, "radius": radius, "bsdf": bsdf}
@@ -279,14 +276,14 @@ GRAZED = ball("outline of a glass ball", lens, "ball.to_world")
 @pytest.mark.slow
 @pytest.mark.parametrize("cell", MISSING, ids=lambda c: c.name)
 def test_table_of_edges_that_light_paths_leave_out(cell: Mean) -> None:
-    z, _ = in_expectation(cell, EDGE_SEEDS)
+    z, _ = in_expectation(cell)
     assert abs(z) > Z_LIMIT, "this edge is in the gradient now: move the cell, and the row of docs/particles.md"
 
 
 @pytest.mark.slow
 def test_the_outline_of_smooth_glass_is_no_edge() -> None:
     """Light that grazes glass is reflected forwards, so that it continues as if it had missed the glass."""
-    z, _ = in_expectation(GRAZED, EDGE_SEEDS)
+    z, _ = in_expectation(GRAZED)
     assert abs(z) < Z_LIMIT
 
 

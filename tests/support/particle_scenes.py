@@ -288,6 +288,8 @@ def blocks(images: np.ndarray) -> np.ndarray:
 def dome(light: str = "point", eye: str = "perspective", bsdf: dict | None = None, rfilter: str = "gaussian") -> dict:
     """A ball seen from inside: nothing in it has an outline or a crease that light paths meet.
 
+    The poles of its texture, where differences do not converge, are out of view.
+
     Area lights are behind the camera, whose paths then have two segments at most. With the sensor `meter`, the ball
     measures its irradiance.
     """
@@ -317,7 +319,7 @@ def dome(light: str = "point", eye: str = "perspective", bsdf: dict | None = Non
     }  # fmt: skip
     paint = {"type": "diffuse", "reflectance": painted(smooth_colours())}
     skin = {
-        "type": "sphere", "to_world": T().scale(1.6), "flip_normals": True,
+        "type": "sphere", "to_world": T().rotate([1, 0, 0], 90) @ T().scale(1.6), "flip_normals": True,
         "bsdf": bsdf or {"type": "twosided", "bsdf": paint},
     }  # fmt: skip
     parts = {"type": "scene", "light": lights[light](), "dome": skin}
