@@ -147,10 +147,6 @@ def _at_surface(
     d, J = kept.d, mi.Float(1)
     if attached:
         holds = smooth & ~keeps_direction(trace, si, smooth) & ~is_seen_through(trace, again.hit_next)
-        if trace.to_sensor is not None:
-            # A direction that follows a point on curved glass or on a mirror is magnified by each of them. No edge
-            # requires it there (see docs/particles.md).
-            holds &= is_smooth(again.hit_next.shape.bsdf())
         d, J = moved_direction(trace.traits.tables.blend_lengths, si, kept.d, again.hit_next, holds)
 
     if trace.resamples:
