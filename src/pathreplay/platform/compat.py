@@ -16,7 +16,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -212,7 +212,7 @@ def has_normals(mesh: mi.Mesh) -> bool:
     return bool(getattr(mesh, name)())
 
 
-def _with_space(values: NDArray[Any]) -> NDArray[Any]:
+def _with_space(values: NDArray[np.generic]) -> NDArray[np.generic]:
     """Return the values in memory that continues behind them.
 
     Dr.Jit uses the memory of a NumPy array in place. On LLVM it reads whole packets of numbers, also beyond the end,
