@@ -47,10 +47,10 @@ class ParticleIntegrator(PathReplayIntegrator):
     - ``samples_per_pass``: accepted as in ``ptracer``, without effect: memory does not depend on the number of paths.
     - ``attach``, ``boundary`` and ``boundary_spp``: as in `PathReplayIntegrator`. The boundary term contains the edges
       of directly visible emitters only.
+    - Other properties of `PathReplayIntegrator`, except ``caustics``, concern the camera rays only.
 
-    Sensors: ``perspective``,
-    ``thinlens``, ``orthographic`` and ``irradiancemeter``. The image is that of a film with ``sample_border = true``
-    (see `ParticleFilm`).
+    Sensors: ``perspective``, ``thinlens``, ``orthographic`` and ``irradiancemeter``. The image is that of a film with
+    ``sample_border = true`` (see `ParticleFilm`).
 
     Not differentiated: the visibility of vertices from each other and from the sensor; with ``attach='none'``, all
     motion; with a box filter, the motion of film positions.
