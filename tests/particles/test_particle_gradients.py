@@ -76,7 +76,7 @@ ONCE = {"depth": 2, "step": 1e-3}
 """Of what moves a vertex from which a smooth lobe continues: random directions there are fixed differently."""
 CELLS = (
     cell("heights, mirror", mirror, "mirror.vertex_positions", waves, step=1e-2),
-    cell("heights, slab", slab, "top.vertex_positions", waves, spp=2048, **SLAB),
+    cell("heights, slab", slab, "top.vertex_positions", waves, depth=4, step=3e-3),
     cell("receiver, mirror", mirror, "ceiling.to_world", POSE, **SLOW),
     cell("receiver, slab", slab, "floor.to_world", POSE, **SLAB),
     cell("camera, slab", slab, "sensor.to_world", POSE, **SLAB),
@@ -94,7 +94,7 @@ CELLS = (
     cell("aperture_radius", partial(dome, eye="thinlens"), "sensor.aperture_radius", add(), **SLOW),
     cell("point", dome, "light.position", add([0.3, 0.5, 0.7]), depth=2, step=3e-4),
     cell("point, rough", partial(dome, bsdf=ROUGH), "light.position", add([0.3, 0.5, 0.7]), **ONCE),
-    cell("spot", partial(dome, "spot"), "light.to_world", POSE, depth=2, step=3e-4),
+    cell("spot", partial(dome, "spot"), "light.to_world", POSE, depth=2, step=3e-3),
     cell("area", partial(dome, "area"), "light.to_world", POSE, **ONCE),
     cell("projector", partial(dome, "projector"), "light.to_world", translate(0.3, 0.5, 0.7), **ONCE),
     cell("directional", partial(plane, "directional", bsdf=ROUGH), "light.to_world", rotate(0.3, 0.5, 0.7), **ONCE),
