@@ -86,7 +86,6 @@ def test_derivatives_are_those_of_central_differences(name: str, tmp_path: Path)
         assert np.sum(np.array(dr.grad(tensor)) * direction) == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", JOBS)
 def test_the_loss_falls_from_the_transport(name: str, tmp_path: Path) -> None:
     config = job(name, tmp_path, iterations=20, spp=64, learning_rate=RATES[name], warmup_steps=4)
@@ -94,7 +93,6 @@ def test_the_loss_falls_from_the_transport(name: str, tmp_path: Path) -> None:
     assert result.history[-1].loss < 0.5 * result.history[0].loss
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two surfaces", "mirror"])
 def test_the_loss_falls_from_flat_surfaces(name: str, tmp_path: Path) -> None:
     config = job(name, tmp_path, iterations=30, spp=16, learning_rate=4 * RATES[name], warmup_steps=4)
