@@ -52,6 +52,16 @@ def job(name: str, folder: Path, **changes: Any) -> dict[str, Any]:
     return config | {"output": str(folder / "run"), "eval_spp": 64, **changes}
 
 
+@pytest.mark.parametrize("file", sorted({file for file, _, _ in JOBS.values()}))
+def test_the_examples_start_within_their_bounds_and_in_the_glass(file: str) -> None:
+    """As they are: the heights of the transport depend on the photograph."""
+    problem = build_problem(load_config(EXAMPLES / file), EXAMPLES)
+    assert np.ptp(problem.variables[0].start) > 0.01
+    bounds = {table.key: (table.lower, table.upper) for table in problem.config.parameters}
+    if "entry" in bounds:  # heights are positive towards the receiver, and the slab is 0.2 thick
+        assert bounds["entry"][1] - 0.2 < bounds["exit"][0]
+
+
 def image_of(problem: Problem, values: dict[str, np.ndarray]) -> np.ndarray:
     put_values(problem, values)
     return np.array(mi.render(problem.scene, integrator=problem.integrator, spp=64, seed=3), np.float64)
