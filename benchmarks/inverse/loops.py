@@ -200,11 +200,11 @@ def differences(integrator: str) -> Entry:
     )
 
 
-def own(of_grids: Mapping[str, Any] | None = None, **settings: Any) -> Entry:
+def own(of_grids: Mapping[str, Any] | None = None, few: bool = False, **settings: Any) -> Entry:
     """This project, with options of textures and volumes, and settings of `pathreplay.init`."""
     return Entry(
         lambda task, rate, spp, seed: Own(task, rate, spp, seed, of_grids or {}, **settings),
-        lambda kind: of_grids is None or kind.has_grid,
+        lambda kind: (of_grids is None or kind.has_grid) and (kind.few or not few),
         warm_up=3,
     )
 
@@ -215,6 +215,7 @@ ENTRIES: dict[str, Entry] = {
     "path, central difference": differences("path"),
     "pathreplay": own(),
     "pathreplay, pyramid": own(of_grids={"pyramid": True}),
+    "pathreplay, Levenberg-Marquardt": own(few=True, optimizer="levenberg-marquardt", view_batch_size=None),
 }
 
 

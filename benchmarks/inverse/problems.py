@@ -18,6 +18,7 @@ class Kind:
     make: Callable[[int, int], Problem]  # pixels of an edge of images, cells of an edge of textures and grids
     integrators: tuple[str, ...] = ("prb",)
     has_grid: bool = False  # textures or volumes among the unknowns
+    few: bool = False  # no more unknown numbers than Levenberg-Marquardt takes
     heavy: bool = False  # takes longer than others
     pixels: int = 24  # of an edge in a full run
 
@@ -33,11 +34,11 @@ NO_GRADIENT = ("path",)
 
 PROBLEMS: dict[str, Kind] = {
     "texture under a sky": Kind(texture, has_grid=True, pixels=48),
-    "camera: pose and focal length": Kind(camera, PROJECTIVE + NO_GRADIENT),
-    "room: two lamps, four materials": Kind(room),
+    "camera: pose and focal length": Kind(camera, PROJECTIVE + NO_GRADIENT, few=True),
+    "room: two lamps, four materials": Kind(room, few=True),
     "cloud": Kind(cloud, ("prbvolpath",), has_grid=True, heavy=True),
     "object: albedo and roughness, unknown sky": Kind(object_under_sky, has_grid=True, pixels=48),
     "glass pane: index and normals": Kind(glass, has_grid=True, heavy=True),
     "mesh by shadows": Kind(mesh, PROJECTIVE, heavy=True),
-    "metal fitted by principled": Kind(metal),
+    "metal fitted by principled": Kind(metal, few=True),
 }
