@@ -16,7 +16,7 @@ MARKS = (1 / 3, 1 / 10, 1 / 30)
 """Fractions of the initial held-out error."""
 MIDDLE = MARKS[1]
 GROWTH = 2**0.5
-"""Ratio of the iterations after which the error is measured."""
+"""Ratio of the iterations after which the error is measured by default."""
 LOST = 1e30
 """Error of values that are not finite; records hold finite numbers only."""
 
@@ -25,16 +25,21 @@ Clock = Callable[[], float]
 
 
 def followed(
-    loop: Loop, error: Callable[[Values], float], goal: float, budget: float, clock: Clock = time.process_time
+    loop: Loop,
+    error: Callable[[Values], float],
+    goal: float,
+    budget: float,
+    clock: Clock = time.process_time,
+    growth: float = GROWTH,
 ) -> Curve:
     """Run a loop until its error is ``goal`` times the initial one or its iterations have taken ``budget`` seconds.
 
     Seconds are processor time, so that other processes disturb less. The clock stands while the error is measured. A
-    value that is not finite ends the run.
+    value that is not finite ends the run. ``growth`` is the ratio of the iterations after which the error is measured.
     """
     errors, steps, seconds = [error(loop.values())], [0], [0.0]
     while seconds[-1] < budget and errors[-1] > goal * errors[0]:
-        target = max(steps[-1] + 1, round(steps[-1] * GROWTH))
+        target = max(steps[-1] + 1, round(steps[-1] * growth))
         done, start = steps[-1], clock()
         while done < target and seconds[-1] + clock() - start < budget:
             loop.step()

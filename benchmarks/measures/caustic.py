@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from ..inverse.caustic import CELLS, Design, DesignLoop
-from ..inverse.search import followed, warmed
+from ..inverse.search import GROWTH, followed, warmed
 from .job import Curve, Job, Measure
 from .methods import parts
 
-SEARCH = 1 / 4
+SEARCH = 1 / 8
 """Time of each point of the grid, as a fraction of that of a design."""
+SEARCH_GROWTH = 8.0
+"""Ratio of the iterations after which the error is measured in the search, which needs the last error only."""
 SEARCH_SEED = 1000
 """Seed of the search, which no round has."""
 
@@ -37,7 +39,7 @@ class Caustic(Measure):
             return curve.seconds[-1], np.array([curve.errors[-1]])
         start = time.process_time()
         self.curves[method] = [
-            replace(self._run(method, rate, spp, SEARCH_SEED, self.job.budget * SEARCH), searched=True)
+            replace(self._run(method, rate, spp, SEARCH_SEED, self.job.budget * SEARCH, SEARCH_GROWTH), searched=True)
             for spp, rate in product(self.job.samples, self.job.rates)
         ]
         return time.process_time() - start, np.array([chosen(self.curves[method]).errors[-1]])
@@ -49,11 +51,11 @@ class Caustic(Measure):
         """All curves; the curves of the search come first."""
         return {name: {"curves": [asdict(curve) for curve in self.curves[name]]} for name in kept}
 
-    def _run(self, method: str, rate: float, spp: int, seed: int, budget: float) -> Curve:
+    def _run(self, method: str, rate: float, spp: int, seed: int, budget: float, growth: float = GROWTH) -> Curve:
         gc.collect()
         loop = DesignLoop(self.design, *parts(method), rate, spp, seed)
         untimed = warmed(loop, 2)
-        curve = followed(loop, lambda values: self.design.error(values["heights"]), 0, budget)
+        curve = followed(loop, lambda values: self.design.error(values["heights"]), 0, budget, growth=growth)
         return replace(curve, rate=rate, spp=spp, seed=seed, warm_up=untimed)
 
 

@@ -17,7 +17,7 @@ from ..tables import groups, markdown, pooled
 from .depth import fastest, memory_cell, seconds_cell
 
 TITLE = "particles"
-TAKES = (60, 2700)
+TAKES = (60, 3700)
 OURS, BASELINE = "particles", "ptracer"
 
 #: Memory: light paths of a pass, as samples per pixel of 50 x 50 pixels.
@@ -32,9 +32,9 @@ CASES = {
 DEPTHS, QUICK_DEPTHS = (4, 16, 48), (4,)
 #: Caustic designs: the grid of learning rates (in widths of the slab) and samples per pixel, and processor seconds.
 SMALL, LARGE = CELLS
-RATES, QUICK_RATES = (3e-7, 3e-6, 3e-5), (3e-5,)
+RATES, QUICK_RATES = (1e-6, 3e-6, 1e-5, 3e-5), (3e-5,)
 DESIGN_SAMPLES, QUICK_DESIGN_SAMPLES = (4, 32), (4,)
-SECONDS, QUICK_SECONDS = 60.0, 2.0
+SECONDS, QUICK_SECONDS = 180.0, 2.0
 #: Fractions of these seconds.
 MOMENTS = (0.1, 0.3, 1.0)
 
