@@ -232,7 +232,7 @@ class Fixed:
         self.b, self.branching = dr.opaque(mi.Float, b), dr.opaque(mi.Float, 0.2)
         self.cells = BaselineCells.of(scene.bbox())
 
-    def look(self, *_: Any) -> Any:
+    def lookup(self, *_: Any) -> Any:
         return mi.Spectrum(self.b)
 
 
