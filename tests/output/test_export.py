@@ -24,6 +24,7 @@ from pathreplay.jobs import make_config, optimize
 from pathreplay.output.export import export_run, write_files
 from pathreplay.output.scene_folder import Exported, Source, exported, require_same
 from pathreplay.scenes.builtin import BUILTINS
+from pathreplay.scenes.caustics import sheet
 from pathreplay.scenes.parameters import get_array
 from pathreplay.scenes.volume_files import load_volume, save_vol
 from room_job import JOB, SCENE
@@ -64,6 +65,12 @@ SMALL: dict[str, dict[str, int]] = {
 @pytest.mark.parametrize("name", BUILTINS)
 def test_every_built_in_scene_comes_out_as_it_is(name: str, tmp_path: Path) -> None:
     scene = BUILTINS[name](resolution=12, **SMALL.get(name, {}))
+    same_pictures(exported(Source(scene, {}, {}, {}), {}), tmp_path / "out")
+
+
+def test_a_made_mesh_of_metal_comes_out(tmp_path: Path) -> None:
+    scene = BUILTINS["caustic-mirror"](resolution=12, **SMALL["caustic-mirror"])
+    scene["mirror"] = sheet(6, 6, 1.0, {"type": "conductor", "material": "Cu", "specular_reflectance": 0.9})
     same_pictures(exported(Source(scene, {}, {}, {}), {}), tmp_path / "out")
 
 

@@ -27,8 +27,12 @@ _ALSO_PLACES = {
 }
 """Properties by plugin whose effect `mi.traverse` includes in `to_world`. An exported `to_world` replaces them."""
 
-# Materials and emitters of existing mesh objects that can be exported: class, plugin, and the plugin's only property.
-_KNOWN = {"SmoothDiffuse": ("diffuse", "reflectance"), "AreaLight": ("area", "radiance")}
+# Materials and emitters of existing mesh objects that can be exported: class, plugin, and all properties of the plugin.
+_KNOWN: dict[str, tuple[str, tuple[str, ...]]] = {
+    "SmoothDiffuse": ("diffuse", ("reflectance",)),
+    "SmoothConductor": ("conductor", ("eta", "k", "specular_reflectance")),
+    "AreaLight": ("area", ("radiance",)),
+}
 _PLAIN_SPECTRA = ("SRGBReflectanceSpectrum", "UniformSpectrum")
 
 
@@ -128,22 +132,25 @@ class Placing:
     def _known(self, instance: mi.Object, what: str) -> mi.Properties:
         """Describe an existing material or emitter by properties.
 
-        Raises PathreplayError unless the object is a diffuse material or an area light, of constant colour, or glass.
+        Raises PathreplayError unless the object is a diffuse material, a conductor or an area light, of constant
+        colours, or glass.
         """
-        if instance.class_name() == "SmoothDielectric" and mi.traverse(instance).keys() == {"eta"}:
-            properties = mi.Properties("dielectric")
-            properties["int_ior"], properties["ext_ior"] = float(mi.traverse(instance)["eta"]), 1.0
-            return properties
-        plugin, part = _KNOWN.get(instance.class_name(), ("", ""))
         params = mi.traverse(instance)
-        owner = params.properties[f"{part}.value"][2] if f"{part}.value" in params else None
-        if owner is None or owner.class_name() not in _PLAIN_SPECTRA:
+        if instance.class_name() == "SmoothDielectric" and params.keys() == {"eta"}:
+            properties = mi.Properties("dielectric")
+            properties["int_ior"], properties["ext_ior"] = float(params["eta"]), 1.0
+            return properties
+        plugin, parts = _KNOWN.get(instance.class_name(), ("", ()))
+        owners = [params.properties[key][2] for part in parts if (key := f"{part}.value") in params]
+        plain = [owner for owner in owners if owner.class_name() in _PLAIN_SPECTRA]
+        if not plugin or len(plain) < len(parts):
             raise PathreplayError(
                 f"The {what} is an existing {instance.class_name()} object, which cannot be exported; give the mesh by "
                 "a file and its materials by dictionaries"
             )
         properties = mi.Properties(plugin)
-        _set_colour(properties, part, get_array(params[f"{part}.value"]))
+        for part in parts:
+            _set_colour(properties, part, get_array(params[f"{part}.value"]))
         return properties
 
     def _number(self, key: str, node: Node, place: str) -> None:
