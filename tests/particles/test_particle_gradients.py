@@ -76,7 +76,7 @@ ONCE = {"depth": 2, "step": 1e-3}
 """Of what moves a vertex from which a smooth lobe continues: random directions there are fixed differently."""
 CELLS = (
     cell("heights, mirror", mirror, "mirror.vertex_positions", waves, step=1e-2),
-    cell("heights, slab", slab, "top.vertex_positions", waves, depth=4, step=3e-3),
+    cell("heights, slab", slab, "top.vertex_positions", waves, depth=4, step=1e-2),
     cell("receiver, mirror", mirror, "ceiling.to_world", POSE, **SLOW),
     cell("receiver, slab", slab, "floor.to_world", POSE, **SLAB),
     cell("camera, slab", slab, "sensor.to_world", POSE, **SLAB),
