@@ -31,7 +31,7 @@ INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Entries of `Tables.groups_at`: WHOLE for shapes whose only edges are outlines, FACETS for flat-shaded meshes."""
 COARSE = 1.0
-"""Mean angle in degrees between triangles and shading normals above which a mesh is coarse."""
+"""Mean angle in degrees between geometric and shading normals above which a mesh is coarse."""
 
 MOST_RUNS = 4096
 """Largest number of runs of equal values in an array that `_array` creates while `dr.freeze` records."""
@@ -66,7 +66,7 @@ class Traits:
     detached_names: tuple[str, ...]  # class names of BSDFs with smooth lobes that are never sampled attached
     area_lights: bool  # some emitter has an outline
     hard_lights: bool  # some emitter casts hard shadows
-    projectors: tuple[mi.Emitter, ...]  # projectors: the region that they light has a hard boundary
+    projectors: tuple[mi.Emitter, ...]  # projectors: the illuminated region has a hard boundary
     spots: tuple[mi.Emitter, ...]  # spot lights: their cone has a hard boundary if beam_width >= cutoff_angle
     mesh_lights: bool  # some mesh emits
     sphere_lights: bool  # some sphere emits
@@ -76,7 +76,7 @@ class Traits:
     two_sides: bool  # some surface may have a different BSDF on its back
     copies: bool  # there are instances
     splines: bool  # there are B-spline curves
-    veils: bool  # some surface may scatter part of the light and pass the rest unscattered
+    veils: bool  # some surface may scatter part of the light and transmit the rest unscattered
     masks_mirrors: bool  # some mask covers delta lobes
     narrow: bool  # some surface may have a narrow smooth lobe
     glossy: bool  # `narrow`, and no checkerboard exists (its seams are not covered by boundary terms)
@@ -237,7 +237,7 @@ def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], othe
 
 
 def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
-    """Return whether (or in which lanes) a BSDF does nothing but pass light unscattered."""
+    """Return whether (or in which lanes) all light passes a BSDF unscattered."""
     others = mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
     return bsdf.flags() & (others | mi.BSDFFlags.Null) == +mi.BSDFFlags.Null
 
