@@ -76,8 +76,7 @@ def jumps_at_facets(
 ) -> mi.Bool:
     """Return whether V is discontinuous between the facets at ``hit``.
 
-    ``p`` and ``n`` are position and normal at the hit. Near the surface, φ depends on the plane of the triangle that was
-    hit.
+    ``p`` and ``n`` are position and normal at the hit. Near the surface, φ depends on the plane of the triangle.
     """
     towards = p - origin.p
     h0 = dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())

@@ -44,7 +44,7 @@ class TraceConfig:
     # Inputs of gradient estimators.
     baseline: Callable[..., mi.Spectrum] | None = None
     """Maps (MediumInteraction3f, extinction, majorant, active) to an estimate of the radiance (Spectrum) that arrives
-    along the ray. Its errors increase the noise of gradients, but not their bias: see `fly_again`. None means zero."""
+    along the ray. A poor estimate increases noise, but causes no bias: see `fly_again`. None means zero."""
     branching: mi.Float | None = None
     """Relative weight c of null collisions (see `branch_weight`), or None without null branching. Null branching starts
     an extra path at one null collision of each path, to estimate derivatives where real collisions cannot occur."""
