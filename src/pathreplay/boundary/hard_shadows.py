@@ -21,7 +21,10 @@ from pathreplay.transport.volume.passage import skip_null
 
 @dataclass
 class ShadowTest:
-    """Test whether a light reaches a point, with occlusion, the image of projectors and the cone of spots."""
+    """Result of a shadow test, i.e. whether a light reaches a point.
+
+    A point is dark if it is occluded, outside a projector's image, or outside a spot's cone.
+    """
 
     u: mi.Point2f  # random numbers that select the light
     lit: mi.Bool  # a light was sampled, and it has no extent
