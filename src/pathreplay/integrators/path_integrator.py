@@ -73,11 +73,11 @@ class PathIntegrator:
 
     name = ""
     attach = "none"
-    uses_sobol = False  # Owen-scrambled Sobol samples replace independent ones
-    boundary = "none"  # estimated boundary terms
+    uses_sobol = False  # whether Owen-scrambled Sobol samples replace independent samples
+    boundary = "none"  # boundary terms that are estimated
     baseline: object = None  # learned state
     interior: Term
-    max_depth: int  # this and the following are members of Mitsuba's integrator
+    max_depth: int  # this member and the next two belong to Mitsuba's integrator
     rr_depth: int
     skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
 

@@ -1,4 +1,4 @@
-"""The term of moving film positions: derivative of the filter weights under a film flow.
+"""The gradient term of a film flow: the derivative of the filter weights when film positions move.
 
 With the filter h_j of pixel j, restricted to the film D, and the velocity v of film positions (see `camera_flow`),
 
@@ -21,7 +21,8 @@ sampled for the pixel at x_j therefore contributes to all pixels of the row, wit
 
     (W_j - W̄_j) sgn df(x - x_j) + Σ_i W̄_i df(x - x_i) / Σ_i |df(x - x_i)|,
 
-where the denominator is the density of all sampled positions of the row. Forward mode is the transpose.
+where the denominator is the density of the positions that are sampled for all pixels of the row. Forward mode is the
+transpose.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class FlowPaths:
 
 @dataclass(frozen=True)
 class FilmMotion:
-    """The term of the film flow (see `Term`). Not differentiated: motion of rays that the flow does not contain."""
+    """The gradient term of a film flow. Not differentiated: motion of rays that the flow does not contain."""
 
     flow: FilmFlow
 
