@@ -121,7 +121,7 @@ def _at_fixed_point(
 
 
 def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:
-    """Return 1 with the derivative of the log area of the sampled emissive triangle.
+    """Return a factor of value 1, whose derivative is the derivative of the log area of the sampled triangle.
 
     The factor is needed because Mitsuba samples a mesh with the triangle areas at load time, without derivatives.
     """

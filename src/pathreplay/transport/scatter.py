@@ -46,7 +46,7 @@ class Sampled:
     pdf_light: mi.Float  # density of sampling the direction of the emitter sample
     w: mi.Spectrum  # weight of the continuation
     kept: SampledContinuation
-    null: mi.Bool  # the continuation passes through without scattering
+    null: mi.Bool  # the continuation passes the surface unscattered
     eta: mi.Float
     active: mi.Bool  # there is a continuation
 

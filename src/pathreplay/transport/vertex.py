@@ -141,7 +141,7 @@ class SampledContinuation:
 class SampledInMedia:
     """Additional choices in a scene with media."""
 
-    null: mi.Bool  # the continuation passes through without scattering
+    null: mi.Bool  # the continuation passes the surface unscattered
     flight: Flight  # the flight to the vertex
     shadow: Shadow  # the shadow ray from the vertex to its emitter sample
 
@@ -261,7 +261,7 @@ class Step:
     e: mi.Spectrum  # emission (MIS weighted) + next-event estimate; on light paths, contribution times image adjoint
     w: mi.Spectrum  # f/p or lobe weight, before Russian roulette
     ray_next: mi.Ray3f
-    pdf: mi.Float  # density of the continuation, for the next vertex
+    pdf: mi.Float  # density of the continuation, for the MIS weight at the next vertex
     signature: Signature
     splat: Splat | None = field(default=None, kw_only=True)  # contribution to the film; None on camera paths
 
@@ -272,7 +272,7 @@ class SampledStep(Step):
 
     kept: SampledContinuation
     eta: mi.Float  # relative index of refraction across the continuation
-    null: mi.Bool  # the continuation passes through without scattering
+    null: mi.Bool  # the continuation passes the surface unscattered
     active: mi.Bool  # there is a continuation
     medium: mi.MediumPtr = None  # type: ignore[assignment]  # medium along the continuation; None in scenes without media
     lighting: Lighting = None  # type: ignore[assignment]  # on surfaces, if emitters have gradients; else None

@@ -49,9 +49,9 @@ class Tables:
     are created while `dr.freeze` records (see `_array`).
     """
 
-    attachable: mi.Bool | None  # by BSDF: its smooth lobes may be sampled attached (None: for no BSDF)
-    blend_lengths: mi.Float  # by shape: `velocity.blend_length`
-    groups_at: mi.UInt32  # by shape: offset of its triangles in `groups`, or `WHOLE` or `FACETS`
+    attachable: mi.Bool | None  # whether the smooth lobes of each BSDF may be sampled attached; None: of no BSDF
+    blend_lengths: mi.Float  # `velocity.blend_length` of each shape
+    groups_at: mi.UInt32  # for each shape, the offset of its triangles in `groups`, or `WHOLE` or `FACETS`
     groups: mi.UInt32  # concatenated `smoothing_groups` of the meshes with an offset; entry 0 is unused
     emitter_bounds: mi.Float  # bounding spheres of mesh emitters: see `emitter_bounds`
 
@@ -261,9 +261,10 @@ def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
-    """Return whether no edge is visible from a surface point: the scene has one shape, which does not see its edges.
+    """Return whether the scene has a single shape, from whose points no edge is visible.
 
-    A flat shape does not see itself. A sphere sees itself from the inside, but has no edge unless a texture has a seam.
+    A flat shape is not visible from its own points. The inside of a sphere is, but has no edge unless a texture has a
+    seam.
     """
     if len(shapes) != 1 or shapes[0].is_emitter():
         return False
