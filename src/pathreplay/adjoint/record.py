@@ -62,7 +62,7 @@ def _bytes(layout: Layout) -> int:
 
 
 def room_for(trace: TraceConfig) -> int:
-    """Return the number of records per path. With media, this allows two null boundaries per vertex (convex media)."""
+    """Return the number of records per path. With media, two null boundaries per vertex are expected (convex media)."""
     if trace.media is None:
         return device_of(mi.variant()).room(max(trace.max_depth, 1))
     return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)

@@ -48,7 +48,7 @@ def replay_attached(
     with dr.resume_grad():
         o, d = start.repeat()
         if dr.grad_enabled(o, d):
-            dr.eval(q, L, overflow)  # otherwise, each entry of the camera matrix would repeat the first pass
+            dr.eval(q, L, overflow)  # otherwise, each gradient of a camera parameter would repeat the first pass
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
             backward(sum((q0[k] * x[k] for k in range(1, 4)), q0[0] * x[0]))

@@ -67,7 +67,7 @@ def record_path(
 
 @dataclass
 class RecordedPath:
-    """``count`` consecutive vertices of a path in the records, from index ``first`` on."""
+    """Part of a recorded path: ``count`` consecutive vertices, stored from index ``first`` on."""
 
     layout: Layout
     records: dr.Local[object]
