@@ -32,7 +32,7 @@ Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
 
 @dataclass
 class Crease:
-    """An edge other than an outline between the hits of two rays, if there is one."""
+    """Edge other than an outline between the hits of two rays: surface contact, hard shadow, or black shading."""
 
     a: mi.PreliminaryIntersection3f
     b: mi.PreliminaryIntersection3f

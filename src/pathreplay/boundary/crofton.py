@@ -37,7 +37,7 @@ probability of 2^-7."""
 PARTS = 3
 """Number of bisections in each half of a segment that locate the end of the part around the middle that differs."""
 MIN_FRACTION = 9 / 32
-"""Fraction below which `middle_weight` is constant: the mean of two adjacent results of `middle_fraction`."""
+"""Fraction below which `middle_weight` is constant. It is halfway between two results of `middle_fraction`."""
 BEYOND = 1.5
 """Distance beyond the fixed end at which a suspected crack is probed, in lengths of the final interval. In the square
 of an emitter this distance is less than `emitters.BORDER`."""
@@ -51,7 +51,7 @@ class VisibilityProbe:
     p: mi.Point3f  # the visible point; zero if no surface is visible
     n: mi.Normal3f
     moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # may move; edges between static points are ignored
-    # Importance of an adjacent edge, as far as a single probe can estimate it:
+    # Factors of the importance of an adjacent edge that can be estimated from a single probe:
     near: mi.Float = field(default_factory=lambda: mi.Float(1))  # reciprocal distance of the visible point
     bright: mi.Float = field(default_factory=lambda: mi.Float(1))  # estimate of the radiance
     # For coarse meshes with smooth shading, where the plane of a triangle may occlude light:

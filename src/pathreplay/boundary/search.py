@@ -53,7 +53,7 @@ class EdgeSearch(ABC, Generic[Segments]):
         return search.resolve(search.draw(chosen.index, n, seed), weight, generator)
 
     def guided(self, n: int, seed: mi.UInt32) -> EdgeSearch[Segments]:
-        """Return a search whose density a pilot pass has refined; without a pilot pass, this search."""
+        """Return a search with a density that a pilot pass has refined, or this search if there is no pilot pass."""
         return self
 
     @abstractmethod
