@@ -155,14 +155,14 @@ def _origin(
 
 
 def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-    """Return 1 with the derivative of the log area of the emitting triangle, which Mitsuba omits (see `emitters`)."""
+    """Return a factor of value 1, with the derivative of the log area of the emitting triangle. Mitsuba omits it."""
     hit, back, on_mesh = _origin(trace, emitter, ray, active)
     area = dr.norm(surface_point(hit, back, on_mesh).A)
     return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)
 
 
 def _outwards(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-    """Return whether a ray leaves the outside of the mesh that emits it.
+    """Return whether a ray leaves its mesh emitter on the outside.
 
     Mitsuba samples directions around the interpolated normal. Some of these directions point below the triangle, so
     that the mesh itself blocks the light. Such rays must be rejected, because Mitsuba offsets their origins to the
