@@ -334,7 +334,7 @@ class PathReplayIntegrator(PathIntegrator):
         return replace(state, guess=learned.guess, passes=learned.passes)
 
     def keep(self, scene: mi.Scene, state: PassState) -> None:
-        """Log lost paths, and learn from the results. Does nothing in a user's recording, which cannot read results."""
+        """Warn of incomplete gradients, and update the learned state. Does nothing while `dr.freeze` records."""
         if is_recording():
             return
         result = state.result
@@ -398,7 +398,7 @@ class PathReplayIntegrator(PathIntegrator):
             mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
     def options(self) -> Json:
-        """Return the properties of this integrator, except the ones that all path integrators share."""
+        """Return the properties of this integrator, except for the properties of `PathIntegrator`."""
         return {
             "adjoint": "auto" if self.interior.auto else self.adjoint,
             "attach": self.attach,

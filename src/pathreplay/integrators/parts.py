@@ -42,8 +42,8 @@ MOST_IN_ALL = 2**36
 def parts(view: Pass) -> list[Pass]:
     """Split a pass of many samples into parts with weights ``share``; the first part keeps the seed.
 
-    Returns the pass itself if it needs no split.
-    Raises PathreplayError if Dr.Jit cannot count one sample per pixel, or for more than `MOST_IN_ALL` samples.
+    Returns the pass itself if it needs no split. Raises PathreplayError for films with more than `MOST_SAMPLES` pixels,
+    and for more than `MOST_IN_ALL` samples.
     """
     width, height = film_size(view.sensor)
     pixels = width * height
@@ -102,7 +102,7 @@ def summed(scene: mi.Scene, passes: Sequence[Pass]) -> Iterator[Callable[[], Non
     try:
         yield (lambda: None) if sums is None else sums.take
     finally:
-        if sums is not None:  # even after an error, because the sums include the gradients of earlier passes
+        if sums is not None:  # also after an error, because the sums include the gradients of earlier passes
             sums.give()
 
 

@@ -179,7 +179,7 @@ class PathIntegrator:
                     part, trace, terms = self._planned(part, state)
                     learned = self._learned(part, trace, state)
                     weighted = grad_in if part.share == 1 else grad_in * part.share
-                    with dr.isolate_grad():  # postpones traversal of the film flow, which the terms share, to the end
+                    with dr.isolate_grad():  # postpones traversal of the film flow, which all terms share, to the end
                         result = self._backward(terms, part, trace, weighted, learned)
                 self._log_notes(part, trace, result)
                 state = state.after(result)

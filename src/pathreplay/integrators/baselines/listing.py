@@ -37,7 +37,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
     """
     if dr.hint(trace.media is None, mode="scalar"):
         raise PathreplayError("prb_volume_listing differentiates media, and the scene has none: use 'pathreplay'")
-    # Uses Mitsuba's interface for all media, so that every tracked collision can be differentiated.
+    # Use Mitsuba's interface for all media, so that every tracked collision can be differentiated.
     trace = replace(trace, media=replace(trace.media, grids=(), plain=True))
     sampler, path = start.sampler, PathState.begin(trace, start)
     if dr.hint(path_moves(trace, start, path.at), mode="scalar"):

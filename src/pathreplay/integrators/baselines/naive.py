@@ -47,8 +47,8 @@ def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter)
 def _cut(state: T) -> T:
     """Return the same values. During AD traversal, the derivatives of these values are evaluated to memory.
 
-    Otherwise the reverse pass is a single kernel whose size grows with depth. At 64 vertices, compilation takes a
-    minute.
+    Without this function, the reverse pass would be a single kernel, whose size grows with depth. At 64 vertices,
+    compilation takes a minute.
     """
 
     class Cut(dr.CustomOp):
@@ -82,7 +82,7 @@ def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, 
         valid = mi.Bool(trace.background_is_opaque) & path.active
     moves = path_moves(trace, start, at)
     L = mi.Spectrum(0)  # accumulated radiance
-    β = mi.Spectrum(1)  # attached throughput; origin, direction and density of the arrival below are attached as well
+    β = mi.Spectrum(1)  # attached throughput; ``o``, ``d`` and ``pdf`` below are attached as well
     first = start.ray if moves else at.ray
     o, d, pdf = mi.Point3f(first.o), mi.Vector3f(first.d), mi.Float(at.pdf)
 

@@ -81,10 +81,10 @@ class FilmFlow(Protocol):
         """
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
-        """Return zero, whose derivative with respect to the parameters is the film velocity v."""
+        """Return an AD variable of value zero, whose derivative with respect to the parameters is the velocity v."""
 
     def divergence(self, sample: Sample) -> mi.Float:
-        """Return zero, whose derivative with respect to the parameters is the divergence ∂v_x/∂x + ∂v_y/∂y."""
+        """Return an AD variable of value zero, whose derivative is the divergence ∂v_x/∂x + ∂v_y/∂y."""
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
         """Return whether the velocity at a film position may be non-zero."""

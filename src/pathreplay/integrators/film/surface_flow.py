@@ -58,7 +58,7 @@ class SurfaceFlow:
     """The flow of a static sensor: see `FilmFlow`."""
 
     sensor: mi.Sensor
-    nodes: mi.Vector2f  # per grid node: zero, whose derivative is the velocity
+    nodes: mi.Vector2f  # AD variables of value zero; their derivatives are the velocities at the grid nodes
     flows: mi.Bool  # per cell, at the cell's first node: whether the velocity may be non-zero in or next to the cell
     is_all: bool = False
     samples: int = 5
