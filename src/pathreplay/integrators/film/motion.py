@@ -51,9 +51,9 @@ from pathreplay.transport.vertex import TraceConfig
 GROUP = 5
 """Number of paths with the same random numbers: right and left, above and below, and one for the divergence."""
 BLUR, MOST = 16, 16
-"""The local mean of the adjoint is taken over a square. From a pixel to each side, the square extends over 1 / BLUR of
-the film's shorter side, but at most MOST pixels. The noise of the term that contains the local mean falls with the
-third power of this length, if the adjoint is smooth over the square."""
+"""The local mean of the adjoint at a pixel is the mean over a square around the pixel. The square extends to each side
+by 1 / BLUR of the film's shorter side, but by at most MOST pixels. The noise of the term that contains the local mean
+falls with the third power of this length, if the adjoint is smooth over the square."""
 
 
 @dataclass
