@@ -166,7 +166,7 @@ def _outwards(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active:
 
     Mitsuba samples directions around the interpolated normal. Some of these directions point below the triangle, so
     that the mesh itself blocks the light. Such rays must be rejected, because Mitsuba offsets their origins to the
-    outside, so that they would hit the mesh.
+    outside, and they would then hit the mesh.
     """
     hit, back, on_mesh = _origin(trace, emitter, ray, active)
     n = hit.compute_surface_interaction(back, compat.shading(), on_mesh).n
