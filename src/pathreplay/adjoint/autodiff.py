@@ -15,7 +15,7 @@ from pathreplay.transport.vertex import Arrival, Step, TraceConfig, VertexRecord
 
 
 class Unreached(PathreplayError):
-    """Raised if the light paths depend on no parameter with gradients. Callers that know the scene add the remedy."""
+    """Raised if the light paths depend on no parameter with gradients. Callers that know the scene add a remedy."""
 
 
 @dataclass
@@ -38,7 +38,7 @@ class RayDerivative:
 
 
 class NonFiniteCounter:
-    """Counts the paths that lost a part of their gradient, because it was not finite or a record was full."""
+    """Counts the paths whose gradient is incomplete, because a part was not finite or a record was full."""
 
     def __init__(self) -> None:
         self.count = dr.zeros(mi.UInt32, 1)
@@ -104,7 +104,7 @@ def backward_step(
 def forward_step(
     trace: TraceConfig, v: VertexRecord, attached: bool, tangent: RayDerivative, active: mi.Bool
 ) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative]:
-    """Evaluate step i again; return it with the tangents of its emission e_i, its weight w_i and the next arrival."""
+    """Evaluate step i again; return the step, and the tangents of e_i, w_i and the next arrival."""
     with dr.resume_grad():
         at = _with_tangent(v.at, tangent) if attached else v.at
         step = repeat_step(trace, replace(v, at=at), attached, active)
@@ -141,7 +141,7 @@ def forward_splat(
     footprint: Callable[[mi.Point2f], F],
     active: mi.Bool,
 ) -> tuple[Step, SplatTangent[F], mi.Spectrum, RayDerivative]:
-    """Evaluate a step of a light path again; return it with the tangents of its splat, weight and next arrival."""
+    """Evaluate a step of a light path again; return it, and the tangents of splat, weight and next arrival."""
     with dr.resume_grad():
         at = _with_tangent(v.at, tangent) if attached else v.at
         step = repeat_step(trace, replace(v, at=at), attached, active)
@@ -212,7 +212,7 @@ def tangents(*values: Any) -> list[Any]:
 def backward(target: mi.Float) -> None:
     """Back-propagate from a scalar per path.
 
-    Raises Unreached if the scalar depends on no parameter with gradients, instead of a gradient that is silently zero.
+    Raises Unreached if the scalar depends on no parameter with gradients, because all gradients would silently be zero.
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):

@@ -1,11 +1,11 @@
 """The learned baseline of volume gradients: an estimate of the radiance that arrives at a point of a medium.
 
-Two averages are kept for each cell of position and direction. X is the mean radiance along rays with a real collision
-in the cell, and Y along rays that pass through the cell. With p the probability of a real collision, the baseline is
-b = (1 - p) X + p Y. Only earlier passes contribute to b, which is therefore independent of the current pass. The
-control variate of `fly_again` then has mean zero for any b, provided that b is zero where neither real collisions nor
-the null collisions of `null_branching` occur. A poor estimate increases noise and causes no bias. Nothing in this
-module is differentiated.
+Two averages of radiance are stored for each cell of position and direction. X is the mean over rays with a real
+collision in the cell, and Y is the mean over rays that pass through the cell. With p the probability of a real
+collision, the baseline is b = (1 - p) X + p Y. Only earlier passes contribute to b, which is therefore independent of
+the current pass. The control variate of `fly_again` then has mean zero for any b, provided that b is zero where neither
+real collisions nor the null collisions of `null_branching` occur. A poor estimate increases noise and causes no bias.
+Nothing in this module is differentiated.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ from pathreplay.transport.vertex import VertexRecord
 from pathreplay.transport.volume.media import interaction, majorant, span
 
 # Cells along each axis of space, and along each side of the octahedral map of directions. 8³ x 4² cells of two averages
-# with four values each take 256 KiB. Three such arrays exist: averages, their sums, and the sums of the current pass.
-# With more cells, each cell has fewer samples and gradients are noisier: see the cloud of `pathreplay bench media`.
+# with four values each take 256 KiB. Three such arrays exist: the averages, the sums from which they are computed, and
+# the sums of the current pass. With more cells, each cell has fewer samples and gradients are noisier: see the cloud of
+# `pathreplay bench media`.
 CELLS, SIDES = 8, 4
 AVERAGES = 2 * CELLS**3 * SIDES**2  # X and Y side by side
 # Factor by which the previous sums are multiplied when a pass is added. About the last ten passes contribute.
 MEMORY = 0.9
-# Initial relative weight c of null collisions (see `branch_weight`): the inverse of fifty null collisions per path.
+# Initial relative weight c of null collisions (see `branch_weight`): the value for fifty null collisions per path.
 FIRST_BRANCHING = 0.02
 # Number of partial sums over which the numbers of null collisions are distributed.
 SLOTS = 256
-# Weight of the mean over all cells in the average of one cell, as a number of samples of this cell.
+# Weight of the mean over all cells in the average of one cell, in units of samples of this cell.
 PRIOR = 2.0
 
 
@@ -43,7 +44,7 @@ def _channels() -> int:
 
 @dataclass(frozen=True)
 class BaselineCells:
-    """The cells of position and direction, in a box that contains all media."""
+    """The cells of position and direction. The cells of position divide a box that contains all media."""
 
     low: tuple[float, ...]  # Python values, constants for a frozen function
     scale: tuple[float, ...]  # cells per unit of length
@@ -72,13 +73,13 @@ class BaselineStats:
 
     cells: BaselineCells
     sums: mi.Float  # for each average, Σ weight·L in three channels and Σ weight
-    nulls: mi.Float  # numbers of null collisions, in partial sums that are small enough for float32
+    nulls: mi.Float  # partial sums of the numbers of null collisions, each small enough for float32
     paths: int  # number of paths that contribute to ``nulls``
     passes: frozenset[Hashable]  # keys of the passes
 
     @staticmethod
     def none(cells: BaselineCells, *keys: Hashable) -> BaselineStats:
-        """Create empty statistics for the passes that the keys identify; a recorded pass has no key."""
+        """Create empty statistics for the passes with these keys; a recorded pass has no key."""
         sums, nulls = dr.zeros(mi.Float, 4 * AVERAGES), dr.zeros(mi.Float, SLOTS)
         dr.make_opaque(sums, nulls)
         return BaselineStats(cells, sums, nulls, 0, frozenset(keys))
@@ -143,7 +144,7 @@ class BaselineState:
     cells: BaselineCells
     sums: mi.Float  # like `BaselineStats.sums`, with smaller weights for older passes
     branching: mi.Float
-    passes: frozenset[Hashable] = frozenset()  # keys of the passes that contributed: they must not use this state
+    passes: frozenset[Hashable] = frozenset()  # keys of the passes that contributed, which must not use this state
     guess: Baseline = field(init=False)
 
     def __post_init__(self) -> None:

@@ -15,7 +15,7 @@ class Driver(Protocol):
     """Back-propagates the adjoint radiance ``δL`` of each path into the parameters and into the ``start``.
 
     Returns whether the paths move, i.e. whether their vertices or directions depend on parameters with gradients.
-    ``lost`` counts paths that lost a part of their gradient. The caller suspends gradients (`dr.suspend_grad`). Each
+    ``lost`` counts the paths whose gradient is incomplete. The caller suspends gradients (`dr.suspend_grad`). Each
     driver documents what it does not differentiate.
     """
 

@@ -1,7 +1,7 @@
 """The emission-only driver: if only emitted radiance has gradients, a single pass without a record suffices.
 
-L = Σ β_i e_i is linear in emitted radiance, and the throughput β does not depend on emitted radiance. δL β_i de_i is
-therefore back-propagated while the path is sampled.
+L = Σ β_i e_i is linear in the emitted radiance, and the throughput β does not depend on it. The term δL β_i de_i of
+each vertex is therefore back-propagated while the path is sampled.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """Return whether only emitted radiance has gradients: no weight depends on a parameter, and nothing moves.
 
     One step is traced symbolically, which includes the virtual functions of all objects. With media, the result is
-    False. The result is also False if Dr.Jit evaluates virtual calls, because the first vertices may miss some objects.
+    False. The result is also False if Dr.Jit evaluates virtual calls: a step from the first vertices then includes only
+    the objects at these vertices.
     """
     if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False
@@ -48,10 +49,10 @@ def lights_or(other: Driver) -> Driver:
 def emission_only(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into emitted radiance, for paths of any depth.
 
-    Requires `only_emission_varies`. Each vertex contributes the emission of the hit surface and the emitter
-    sample, with the same weights as in the image. A path that leaves the scene also contributes the background. Returns
-    False, because paths do not move. Not differentiated: everything except emitted radiance. Raises PathreplayError if
-    the paths depend on no parameter with gradients.
+    Only valid if `only_emission_varies` is true. Each vertex contributes the emission of the hit surface and the
+    emitter sample, with the same weights as in the image. A path that leaves the scene also contributes the radiance of
+    the environment. Returns False, because paths do not move. Not differentiated: everything except emitted radiance.
+    Raises PathreplayError if the paths depend on no parameter with gradients.
     """
     trace = replace(trace, background_apart=True)
     sampler, path = start.sampler, PathState.begin(trace, start)

@@ -1,9 +1,9 @@
 """Null branching: an extra path from a null collision, for derivatives where real collisions cannot occur.
 
 The derivative at a collision is dσ_s L_s - dσ_t b, with L_s the in-scattered radiance and b the baseline. Where σ_s is
-zero, no path scatters, and nothing estimates L_s. One null collision per path is therefore kept, by weighted reservoir
-sampling, and an extra path from its position (the branch) estimates L_s. `branch_weight` distributes the derivative
-between real and null collisions.
+zero, no path scatters, so that L_s is not estimated. One null collision per path is therefore kept, by weighted
+reservoir sampling, and an extra path that starts there (the branch) estimates L_s. `branch_weight` distributes the
+derivative between real and null collisions.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathreplay.transport.volume.media import interaction, majorant
 
 @dataclass
 class Branch:
-    """The null collision that the reservoir contains (loop state). All fields are zero before the first collision."""
+    """The null collision in the reservoir (loop state). All fields are zero before the first collision."""
 
     p: mi.Point3f  # position of the collision
     d: mi.Vector3f  # direction of the path before the collision
@@ -65,8 +65,8 @@ def branch_backward(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: m
 def branch_term(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ray3f) -> mi.Spectrum:
     """Return a term whose derivative is the branch's contribution to the derivative of the radiance (Spectrum).
 
-    The value of the term has no meaning. The extra path is detached, and takes time and wavelengths from the camera
-    ``ray``. Differentiable in the coefficients of the medium. The caller resumes gradients (`dr.resume_grad`).
+    Only the derivative of the term is meaningful. The extra path is detached, and takes time and wavelengths from the
+    camera ``ray``. Differentiable in the coefficients of the medium. The caller resumes gradients (`dr.resume_grad`).
     """
     onward = replace(trace, branching=None)
     active = branch.mass > 0

@@ -1,17 +1,18 @@
 """The pixel sweep: an image and the gradient of a quadratic loss from the same set of paths, each sampled once.
 
-The adjoint radiance of a path is known only after all paths of its pixel. Each lane therefore samples all N paths of a
-pixel, records each path like `sweep`, and then sweeps back through all records. Let I be the mean of the radiances L_s
-of the paths, and f'(I) the derivative of the loss. The adjoint of a path must not depend on the radiance of the same
-path, because the covariance of L_s and dL_s would bias the gradient. For the same reason, it must not depend on
-correlated paths, such as other stratified samples of the pixel. Paths are therefore drawn in mutually independent
-sets S, and the adjoint of each path uses only the other sets:
+The adjoint radiance of a path is known only after all paths of the pixel have been traced. Each lane therefore samples
+all N paths of a pixel, records each path like `sweep`, and then sweeps back through all records. Let I be the mean of
+the radiances L_s of the paths, and f'(I) the derivative of the loss. The adjoint of a path must not depend on the
+radiance of the same path, because the covariance of L_s and dL_s would bias the gradient. For the same reason, it must
+not depend on correlated paths, such as other stratified samples of the pixel. Paths are therefore drawn in mutually
+independent sets S, and the adjoint of each path uses only the other sets:
 
     δL_s = f'(I_{-S}) / N,    I_{-S} = (N I - Σ_S L) / (N - |S|),    f'(I) = offset + slope · I.
 
 The expected gradient is the same as with an independent image, but the variance is not. First, the noise of the image
-and the noise of its derivative are correlated. The correlation lowers the variance where the loss demands more light,
-and raises it where the loss demands less. Second, the product of these two noises adds a term of second order in 1/N.
+and the noise of its derivative are correlated, in most cases positively. A positive correlation lowers the variance
+where the loss falls with more radiance (f' < 0), and raises it where the loss grows (f' > 0). Second, the product of
+these two noises adds a term of second order in 1/N.
 """
 
 from __future__ import annotations
@@ -53,8 +54,8 @@ def pixel_sweep(
     """Trace ``paths`` paths (two or more) in every lane and back-propagate the loss.
 
     Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` maps (sampler,
-    active) to detached rays and their weights (Ray3f, Spectrum). The scene must have no media. For ``lost``, quantities
-    that are not differentiated, and errors, see `sweep`.
+    active) to detached rays and their weights (Ray3f, Spectrum). The scene must have no media. The documentation of
+    `sweep` describes ``lost``, the errors, and what is not differentiated.
     """
     room, size = room_for(trace), numbers.together(paths)
     total = mi.Spectrum(0)  # radiance of all paths
@@ -65,7 +66,7 @@ def pixel_sweep(
         layout = Layout.of(trace, path_moves(trace, start, PathState.begin(trace, start).at))
     records = dr.alloc_local(record_type(layout), paths * room)
     counts = dr.alloc_local(mi.UInt32, paths)  # number of records of each path
-    ends = dr.alloc_local(mi.Spectrum, paths)  # radiance along the ray that leaves the last recorded vertex
+    ends = dr.alloc_local(mi.Spectrum, paths)  # radiance along the ray from the last recorded vertex
     sets = dr.alloc_local(mi.Spectrum, -(-paths // size), dr.zeros(mi.Spectrum))  # sum of radiances of each set
     s = mi.UInt32(0)  # index of the path
 

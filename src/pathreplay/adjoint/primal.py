@@ -29,8 +29,8 @@ def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool
 def path_radiance(trace: TraceConfig, sampler: Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
     """Continue a path from its present state; return the radiance along the path, and ``valid`` (see `primal`).
 
-    The throughput ``path.β`` must be one, because it is a factor of the result. Reaching the background does not make a
-    path valid.
+    The throughput ``path.β`` must be one, because it is a factor of the result. A path that only reaches the
+    environment is not valid.
     """
     trace = replace(trace, background_apart=trace.media is None)
     L = mi.Spectrum(0)  # radiance so far

@@ -2,9 +2,9 @@
 
 A ray has four degrees of freedom: the position of its origin in the plane perpendicular to the ray, and its direction.
 Moving the origin along the ray changes neither the hit point nor the rest of the path. The Jacobian in the six
-coordinates (o, d) would therefore always be singular. Two quantities of an arrival are not functions of the ray: the
-density, and the distance from the previous vertex. Both affect only the MIS weight of the emission at the next vertex,
-and are differentiated there (`emission_slope`), separately from the matrix.
+coordinates (o, d) would therefore always be singular. Two quantities that belong to the ray are not functions of the
+four coordinates: its density, and the distance from the previous vertex. Both affect only the MIS weight of the
+emission at the next vertex. `emission_slope` differentiates this weight separately from the matrix.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ ILL_CONDITIONED = 1e-4
 class Recovery:
     """How the adjoint q_{i+1} of the next ray is recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i, in float64.
 
-    See `replay_attached` for A_i and p_i. The random number ε_i is +noise or -noise with equal probability. These two
-    values are as far from zero, where the matrix is singular, as the standard deviation ``noise`` permits. The value 0
-    of ``noise`` turns the noise off. Where A_i is ill-conditioned, X_i is the identity on directions and zero on
+    See `replay_attached` for A_i and p_i. The random number ε_i is +noise or -noise with equal probability. Among
+    distributions of standard deviation ``noise``, this one stays farthest from zero, where the matrix is singular. If
+    ``noise`` is 0, no noise is added. Where A_i is ill-conditioned, X_i is the identity on directions and zero on
     origins. Elsewhere, X_i is zero.
     """
 
@@ -46,7 +46,7 @@ class Recovery:
         return dr.float64_array_t(kind)  # type: ignore[no-any-return]
 
     def regularised(self, A: mi.Matrix4f, sign: mi.Float, smooth: mi.Bool) -> mi.Matrix4f:
-        """Return A + ε X. Subclasses may also use ``smooth``, the lanes in which a smooth lobe was sampled."""
+        """Return A + ε X. ``smooth`` marks the lanes in which a smooth lobe was sampled; only subclasses use it."""
         ε = dr.select(independence(A) >= ILL_CONDITIONED, 0, type(A[0, 0])(self.noise * sign))
         return A + type(A)(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, ε, 0, 0, 0, 0, ε)
 
@@ -77,7 +77,7 @@ class RayFrame:
 
 @dataclass
 class Slope:
-    """Derivatives of δL·β e at a vertex with respect to two inputs that the arriving ray does not determine."""
+    """Derivatives of δL·β e at a vertex with respect to two inputs besides the coordinates of the ray."""
 
     pdf: mi.Float  # density of the ray
     slide: mi.Float  # distance by which the origin of the ray moves along the ray
@@ -96,7 +96,7 @@ class Linearised:
 
 @dataclass
 class PeeledPath:
-    """Result of the first pass of attached replay; the second pass updates it from vertex to vertex."""
+    """State of the second pass of attached replay, which starts with the L and q that the first pass has computed."""
 
     δL: mi.Spectrum  # adjoint of the radiance of the path
     L: mi.Spectrum  # β_i L_i
@@ -117,7 +117,7 @@ def length_scale(scene: mi.Scene) -> float:
 
 
 def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
-    """Differentiate weight·e, at constant weight, with respect to the inputs of `Slope`; e is emission at ``at``."""
+    """Differentiate weight·e with respect to the inputs of `Slope`, at constant weight; e is the emission at ``at``."""
     if not has_smooth_lobes(trace):
         return Slope(mi.Float(0), mi.Float(0))
     slopes = []
@@ -163,8 +163,8 @@ def linearise(
 ) -> Linearised:
     """Differentiate `local_terms` with respect to the four coordinates of the ray, and to nothing else.
 
-    ``onward`` is the path at the next vertex, and ``scale`` the unit of length. Both passes call this function, and
-    their values therefore agree to the last bit.
+    ``onward`` is the path at the next vertex, and ``scale`` the unit of length. Both passes call this function, so that
+    their values agree to the last bit.
     """
     slope = emission_slope(trace, onward.at, δL * onward.β, v.go_on)
     frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
@@ -198,7 +198,7 @@ def _unit_tangent(value: mi.Float | float) -> mi.Float:
 
 
 def random_sign(u: VertexSamples) -> mi.Float:
-    """Return +1 or -1 with equal probability, from a hash of the vertex's samples, and thus equal in both passes."""
+    """Return +1 or -1 with equal probability, from a hash of the vertex's samples. Both passes get the same sign."""
     bits = [dr.reinterpret_array(mi.UInt32, x) for x in (u.light.x, u.roulette)]
     return dr.select((mi.sample_tea_32(bits[0], bits[1], 4)[0] & 1) == 0, mi.Float(1), mi.Float(-1))
 

@@ -41,7 +41,7 @@ MAX_RECORDS_MEDIA = 2000
 def deepest(trace: TraceConfig, device: Device | None = None) -> int:
     """Return the largest ``max_depth`` for which the sweep driver can record paths, on the active variant's device.
 
-    On a GPU, the records may use a fraction of its memory (see `pathreplay.platform.device`).
+    On a GPU, the records may use only a fraction of the memory (see `pathreplay.platform.device`).
     """
     device = device_of(mi.variant()) if device is None else device
     if not device.is_gpu:
@@ -52,7 +52,7 @@ def deepest(trace: TraceConfig, device: Device | None = None) -> int:
 
 
 def largest_record(trace: TraceConfig) -> int:
-    """Return the bytes per vertex of the larger layout: static paths record radiance, moving paths random numbers."""
+    """Return the bytes per vertex of the larger of the two layouts, for static and for moving paths."""
     return max(_bytes(Layout.of(trace, moves)) for moves in (False, True))
 
 
@@ -62,7 +62,7 @@ def _bytes(layout: Layout) -> int:
 
 
 def room_for(trace: TraceConfig) -> int:
-    """Return the number of records per path. With media, two null boundaries per vertex are assumed (convex media)."""
+    """Return the number of records per path. With media, two null boundaries per vertex are expected (convex media)."""
     if trace.media is None:
         return device_of(mi.variant()).room(max(trace.max_depth, 1))
     return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)
@@ -103,7 +103,8 @@ class Layout:
         )
 
 
-# Field of `VertexRecord`, its type in Mitsuba, and the property of `Layout` under which it is recorded.
+# Each entry has a field of `VertexRecord`, its type in Mitsuba, and the property of `Layout` under which it is
+# recorded.
 FIELDS = (
     ("at.ray.o", "Point3f", "always"),
     ("at.ray.d", "Vector3f", "always"),
@@ -232,7 +233,7 @@ def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> VertexRecord:
 
 
 def _blank(layout: Layout, ray0: mi.Ray3f) -> VertexRecord:
-    """Return a vertex with default values, which remain in all fields that are not recorded."""
+    """Return a vertex with default values. Fields that are not recorded keep them."""
     zero, no = mi.Float(0), mi.Bool(False)
     ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0), ray0.time, ray0.wavelengths)
     at = Arrival(ray, dr.zeros(mi.PreliminaryIntersection3f), zero, no, no)

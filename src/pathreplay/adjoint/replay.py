@@ -1,7 +1,7 @@
 """The replay driver: sample a path again with the same random numbers, and subtract the radiance of each vertex.
 
 This is path replay backpropagation (Vicini, Speierer, Jakob 2021). The first pass stores only the radiance L_0 of the
-path. At each vertex, the second pass subtracts the contributions up to this vertex from L_0, and so recovers the
+path. The second pass subtracts from L_0 the contributions of the vertices that it has visited. The remainder is the
 radiance from the rest of the path. Memory does not depend on depth. If the path moves with the parameters,
 `replay_attached` recovers the adjoint of the ray as well.
 """
@@ -37,9 +37,9 @@ def replay(
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start``.
 
     Returns whether the path moves with the parameters. If the path moves, ``recovery`` describes how ray adjoints are
-    recovered, and ``lost`` counts the paths with a non-finite ray adjoint. Smooth lobes then cause one warning. Not
-    differentiated: visibility, weights that are exactly zero (in contrast to the sweep driver) and, with
-    ``attach='none'``, all motion. Raises PathreplayError if a path moves in a scene with media.
+    recovered, and ``lost`` counts the paths with a non-finite ray adjoint. If paths move in a scene with smooth lobes,
+    a warning is logged once. Not differentiated: visibility, weights that are exactly zero (in contrast to the sweep
+    driver) and, with ``attach='none'``, all motion. Raises PathreplayError if a path moves in a scene with media.
     """
     # With null branching, zero weights do not end paths. The branch then has the same samples as in other drivers.
     path = PathState.begin(trace, start, sustained=trace.branch)

@@ -35,9 +35,10 @@ def replay_attached(
 ) -> None:
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start`` of a ``path``.
 
-    ``lost`` counts the paths on which some q was not finite and was dropped. The recovery is exact on chains of delta
-    lobes. At smooth lobes, A_i has rank two, and q can be recovered only with noise. The result is then unbiased,
-    unless amplified rounding errors exceed the noise. Not differentiated: visibility and weights that are exactly zero.
+    ``lost`` counts the paths on which an adjoint q was not finite and was set to zero. The recovery is exact on chains
+    of delta lobes. At smooth lobes, A_i has rank two, and q can be recovered only with noise. The result is then
+    unbiased, unless rounding errors, which the inverse amplifies, exceed the noise. Not differentiated: visibility and
+    weights that are exactly zero.
     """
     scale = length_scale(trace.scene)
     again = start.sampler.clone()
@@ -47,7 +48,7 @@ def replay_attached(
     with dr.resume_grad():
         o, d = start.repeat()
         if dr.grad_enabled(o, d):
-            dr.eval(q, L, overflow)  # otherwise, each entry of the camera matrix would repeat the first pass
+            dr.eval(q, L, overflow)  # otherwise, each gradient of a camera parameter would repeat the first pass
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
             backward(sum((q0[k] * x[k] for k in range(1, 4)), q0[0] * x[0]))

@@ -27,11 +27,11 @@ def sweep(
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start``.
 
-    Returns whether the path moves with the parameters. ``lost`` counts the paths that lost a part of their gradient,
-    for one of two reasons. In media, a path is truncated if null boundaries fill its record (see `room_for`). On a path
-    that moves, a ray adjoint that is not finite is set to zero. ``seen`` collects radiance in media for the baseline of
-    later passes. Weights that are exactly zero are differentiated. Not differentiated: visibility and, with
-    ``attach='none'``, all motion.
+    Returns whether the path moves with the parameters. ``lost`` counts the paths whose gradient is incomplete, for one
+    of two reasons. In media, a path is truncated if null boundaries fill its record (see `room_for`). On a path that
+    moves, a ray adjoint that is not finite is set to zero. ``seen`` accumulates the radiance in media, from which the
+    baseline of later passes is computed. Weights that are exactly zero are differentiated. Not differentiated:
+    visibility and, with ``attach='none'``, all motion.
 
     Raises PathreplayError if ``max_depth`` exceeds `deepest`, or if the paths depend on no parameter with gradients.
     """

@@ -27,11 +27,11 @@ def record_path(
     first: mi.UInt32,
     lost: NonFiniteCounter,
 ) -> tuple[dr.Local[object], mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
-    """Record a path from index ``first`` on.
+    """Record a path; ``first`` is the index of its first record.
 
-    Returns the records, their number, the radiance of the path, the radiance from beyond the last record, and the
-    `Branch`. The radiance from beyond the last record does not include the throughput. ``lost`` counts the paths that
-    were truncated because the record was full.
+    Returns the records, their number, the radiance of the path, the radiance that arrives at the last recorded vertex
+    from the environment, and the `Branch`. The fourth value does not include the throughput, and is zero unless
+    ``layout.fixed``. ``lost`` counts the paths that were truncated because the record was full.
 
     All lanes of a packet must write to the same index. Otherwise writes to local memory are lost (Dr.Jit 1.5).
     """
@@ -67,7 +67,7 @@ def record_path(
 
 @dataclass
 class RecordedPath:
-    """``count`` consecutive vertices of a path in the records, from index ``first`` on."""
+    """Part of a recorded path: ``count`` consecutive vertices, stored from index ``first`` on."""
 
     layout: Layout
     records: dr.Local[object]
@@ -79,7 +79,7 @@ class RecordedPath:
 
 @dataclass
 class PathAdjoint:
-    """The state of the reverse pass: radiance along a ray of a path, and adjoints."""
+    """The state of the reverse pass: the radiance along the current ray, and adjoints."""
 
     δL: mi.Spectrum  # adjoint of the radiance of the path
     L: mi.Spectrum  # radiance along the ray

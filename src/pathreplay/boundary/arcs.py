@@ -1,11 +1,11 @@
 """Arcs of directions around a vertex, on which edges between surfaces are searched: see `crofton`.
 
 An arc contains a BSDF sample d, drawn with density p. If d were always the centre of the arc, the variance would be
-practically unbounded for lobes that are narrower than the arc: scattering f at the peak of the lobe is many thousand
-times the density p beside the peak. The sample d therefore lies at one of n positions d_i of the arc, selected at
-random. The density of the arc is the mean of p(d_i), which accounts for all lobes that are wider than the spacing of
-the d_i. Narrower lobes need shorter arcs. The length l_j is selected with probability P_j(p), and a crossing in
-direction z has the weight
+practically unbounded for lobes that are narrower than the arc. An arc whose sample lies beside the lobe has a low
+density p, but may contain the peak, at which the BSDF is many thousand times p. The sample d therefore lies at one of n
+positions d_i of the arc, selected at random. The density of the arc is the mean of p(d_i), which accounts for all lobes
+that are wider than the spacing of the d_i. Narrower lobes need shorter arcs. The length l_j is selected with
+probability P_j(p), and a crossing in direction z has the weight
 
     a_j(z) / (l_j · mean p(d_i) P_j(p(d_i))),        a_j ∝ l_j P_j min(1, p_j / p(z)),        Σ_j a_j = 1,
 

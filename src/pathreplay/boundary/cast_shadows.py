@@ -1,8 +1,8 @@
-"""Cast shadows: film positions, used only to guide the pilot pass, onto which moving shapes may cast a shadow.
+"""Find film positions at which moving shapes may cast shadows. These positions only guide the pilot pass.
 
-The shadow of a small object covers few pixels, and few segments would cross its boundary. A ray therefore starts at a
-point on a moving shape, in the direction in which light arrives at this point. Behind the shape, the ray hits the
-surface on which the shadow may fall. Whether the camera sees this surface is not tested.
+The shadow of a small object covers few pixels, and few segments would cross its boundary. Rays are therefore traced
+from points on moving shapes, away from the light. Behind the shape, a ray hits the surface on which the shadow may
+fall. Whether the camera sees this surface is not tested.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathreplay.transport.vertex import TraceConfig
 SAMPLED = frozenset(map(int, (mi.ShapeType.Sphere, mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Cylinder)))
 RAYS = 1024
 THROUGH = 4
-"""Largest number of intersections with the moving shape itself that a ray ignores."""
+"""Largest number of successive hits on the moving shape itself that a ray ignores."""
 
 
 def casters(trace: TraceConfig) -> list[mi.Shape]:

@@ -36,7 +36,8 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
     """Return the configuration for chains.
 
     Russian roulette is off, because it would end neighbouring paths at different depths. Media and null boundaries are
-    left out, because chains pass through them; `transmittance_of_chain` is a separate factor.
+    left out, because they do not deflect chains. Their transmittance is a separate factor: see
+    `transmittance_of_chain`.
     """
     chain = replace(trace, rr_depth=NEVER, max_depth=min(trace.max_depth, MAX_CHAIN))
     return chain if trace.media is None else replace(chain, media=None, skips_null=True)  # type: ignore[arg-type]
@@ -46,8 +47,8 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
 def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> VisibilityProbe:
     """Probe a path from the camera to its first vertex without a delta lobe.
 
-    Vertices before the first surface that may move are ignored. Where ``flows`` (see `FilmDomain`), the camera ray
-    may move, and all surfaces count as moving.
+    Vertices before the first surface that may move are ignored. In lanes with ``flows`` (see `FilmDomain`), the camera
+    ray may move, so that all surfaces count as moving.
     """
     sampler = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
@@ -90,7 +91,7 @@ def _probe_vertex(trace: TraceConfig, path: PathState, key: mi.UInt32, active: m
 def _scattered(
     trace: TraceConfig, path: PathState, si: mi.SurfaceInteraction3f, key: mi.UInt32, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Return the directions of the emitter sample and of the BSDF sample; zero where nothing is scattered."""
+    """Return the directions of the emitter sample and of the BSDF sample; zero for a sample of weight zero."""
     u, ctx = VertexSamples.draw(CounterSampler.at_vertex(key, path.depth)), mi.BSDFContext()
     light, lit = sample_light(trace, si, u.light, path.depth, active)
     lobe, weight = si.bsdf().sample(ctx, si, u.lobe, u.direction, active & si.is_valid())
@@ -123,7 +124,7 @@ class ChainSplit:
 
 @dr.syntax
 def split_chains(trace: TraceConfig, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: mi.Bool) -> ChainSplit:
-    """Find the first vertex at which two chains with equal random numbers see different surfaces."""
+    """Find the first vertex at which two chains with equal random numbers hit different surfaces."""
     sampler_a, sampler_b = CounterSampler.of(key), CounterSampler.of(key)
     a = PathState.begin(trace, CameraStart(rays[0], sampler_a, active))
     b = PathState.begin(trace, CameraStart(rays[1], sampler_b, active))

@@ -32,7 +32,7 @@ Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
 
 @dataclass
 class Crease:
-    """An edge other than an outline between the hits of two rays, if there is one."""
+    """Edge other than an outline between the hits of two rays: surface contact, hard shadow, or black shading."""
 
     a: mi.PreliminaryIntersection3f
     b: mi.PreliminaryIntersection3f
@@ -73,9 +73,9 @@ def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> 
     """Return the arrivals on two sides of an edge, moved apart where two surfaces form a concave corner.
 
     Ray origins are offset from their surface. If a hit is closer to a contact line than this offset, the ray origin
-    lies behind the other surface, and rays may see the sky below a floor. Radiance is continuous along each surface.
-    The error of moving the hits is therefore proportional to the distance by which they move, some thousandths of the
-    size of objects.
+    lies behind the other surface. Rays from below a floor, for example, would reach the sky. Radiance is continuous
+    along each surface. The error of moving the hits is therefore proportional to the distance by which they move, some
+    thousandths of the size of objects.
     """
     sides = [(at, at.hit.compute_surface_interaction(at.ray, compat.minimal(), active)) for at in (a, b)]
     normals = [dr.select(dr.dot(si.n, at.ray.d) > 0, -si.n, si.n) for at, si in sides]

@@ -2,12 +2,12 @@
 
 Segments of length l are distributed at random over a surface, for example the film or the sphere of directions. Let
 p(c) be the density of their centres, and let their directions be uniform. The expected sum of g / p(c) over all
-crossings with edges is 2 l / π times the integral of g along the edges. Different signatures at the ends of a segment
-indicate a crossing; bisection locates it.
+crossings with edges is 2 l / π times the integral of g along the edges. Different signatures (hashes of the visible
+surfaces) at the ends of a segment indicate a crossing; bisection locates it.
 
-If a segment has two crossings, for example at a corner, its ends are equal. Segments with equal ends are therefore also
-probed in the middle. Two crossings on the same side of the middle are still missed. Segments of which only the middle
-differs therefore have a larger weight: see `middle_weight`.
+If a segment has two crossings, for example at a corner, the signatures at its ends may be equal. Each segment is
+therefore also probed in the middle. Two crossings on the same side of the middle are still missed. In compensation,
+segments that differ only in the middle have a larger weight: see `middle_weight`.
 """
 
 from __future__ import annotations
@@ -32,11 +32,12 @@ is in front of the other's tangent plane, or each is behind: in most such cases,
 ANGLE = 1e-3
 """Smallest angle between two surfaces, in radians, that counts as an edge."""
 CRACK_BISECTIONS = 8
-"""An end that stays fixed in this many successive bisections suggests a crack. At true edges, 1 end in 2^7 does so."""
+"""An end that stays fixed in this many successive bisections suggests a crack. At a true edge, this happens with a
+probability of 2^-7."""
 PARTS = 3
-"""Number of bisections in each half of a segment that locate the end of the differing part."""
+"""Number of bisections in each half of a segment that locate the end of the part around the middle that differs."""
 MIN_FRACTION = 9 / 32
-"""Fraction below which `middle_weight` is constant: the mean of two adjacent results of `middle_fraction`."""
+"""Fraction below which `middle_weight` is constant. It is halfway between two results of `middle_fraction`."""
 BEYOND = 1.5
 """Distance beyond the fixed end at which a suspected crack is probed, in lengths of the final interval. In the square
 of an emitter this distance is less than `emitters.BORDER`."""
@@ -47,10 +48,10 @@ class VisibilityProbe:
     """Visibility at one position of a segment. If two probes differ, an edge lies between them."""
 
     signature: mi.UInt32
-    p: mi.Point3f  # point that is visible; zero if there is none
+    p: mi.Point3f  # the visible point; zero if no surface is visible
     n: mi.Normal3f
     moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # may move; edges between static points are ignored
-    # Importance of an adjacent edge, as far as a single probe can estimate it:
+    # Factors of the importance of an adjacent edge that can be estimated from a single probe:
     near: mi.Float = field(default_factory=lambda: mi.Float(1))  # reciprocal distance of the visible point
     bright: mi.Float = field(default_factory=lambda: mi.Float(1))  # estimate of the radiance
     # For coarse meshes with smooth shading, where the plane of a triangle may occlude light:
@@ -64,7 +65,7 @@ class VisibilityProbe:
         return VisibilityProbe(mi.UInt32(signature), mi.Point3f(0), mi.Normal3f(0))
 
     def differs(self, other: VisibilityProbe) -> mi.Bool:
-        """Return whether the probes see different shapes, or different sheets of one shape: see `hides_itself`."""
+        """Return whether different shapes are visible, or different sheets of one shape: see `hides_itself`."""
         return self.edge_importance(other) > 0
 
     def edge_importance(self, other: VisibilityProbe) -> mi.Float:
@@ -76,7 +77,7 @@ class VisibilityProbe:
         return dr.select(self.moves | other.moves, importance, 0)
 
     def _crease(self, other: VisibilityProbe) -> mi.Bool:
-        """Return whether the probes see different triangles, and a sampled direction lies between their planes.
+        """Return whether different triangles are visible, and a sampled direction lies between their planes.
 
         Only one of the triangles occludes such a direction. Directions close to a plane count as well, because sampled
         directions turn with the shading normal between the probe and the crease. They turn by at most the angle between
@@ -161,7 +162,8 @@ class Survey:
         """Summarise the probes at `probe_positions`."""
         a, b, c = probes
         ends, halves = a.edge_importance(b), dr.maximum(c.edge_importance(a), c.edge_importance(b))
-        # If only the middle differs, the weight is about 4: one of two crossings is selected, see `middle_weight`.
+        # If only the middle differs, the weight is about 4: a factor of 2 because one of two crossings is selected, and
+        # a factor of about 2 from `middle_weight`.
         presence = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
         near = dr.maximum(dr.maximum(a.near, b.near), c.near)
         bright = dr.maximum(dr.maximum(a.bright, b.bright), c.bright)
@@ -179,7 +181,7 @@ def detect(probe: Probe, length: mi.Float, active: mi.Bool) -> mi.Float:
 
 
 def middle_weight(m: mi.Float) -> mi.Float:
-    """Return the weight of a segment whose ends are equal, and whose middle part of relative length ``m`` differs.
+    """Return the weight of a segment whose ends are equal, if a middle part of relative length ``m`` differs.
 
     Consider shifts of the segment along its line, in units of its length. Over a range 1 - m of shifts, the segment
     contains the differing part. Over a range min(m, 1 - m), this part also covers the middle, and is detected. The
@@ -193,9 +195,10 @@ def middle_weight(m: mi.Float) -> mi.Float:
 def middle_fraction(
     probe: Probe, length: mi.Float, at_a: VisibilityProbe, at_b: VisibilityProbe, active: mi.Bool
 ) -> mi.Float:
-    """Return the fraction of a segment, around its middle, that differs from its ends; each half is exact to 1/16.
+    """Return the fraction of a segment, around its middle, that differs from its ends.
 
-    A position belongs to this part if its probe differs from the probe at an end. The part may contain further edges.
+    The error in each half is at most 1/16. A position belongs to this part if its probe differs from the probe at an
+    end. The part may contain further edges.
     """
     half = 0.5 * length
     n, fraction, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)

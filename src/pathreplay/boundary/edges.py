@@ -1,14 +1,14 @@
 """Edges: derivatives due to the motion of edges, propagated along the camera paths that see the edges.
 
-An edge is the zero set of a function B(ray, π) of a ray and the parameters π, and moves with dB/dπ. The contribution of
-the edge to the derivative of the radiance at film position s is
+An edge is the zero set of a function B(ray, π) of a ray and the parameters π. Its motion follows from dB/dπ. The
+contribution of the edge to the derivative of the radiance at film position s is
 
     - Σ K dB/dπ,
 
 summed over the crossings of boundary segments with the edge. K is the weight of a crossing (`Crossing.weight`). A lane
 has one crossing in `primary` and `volumetric`, and up to three in `secondary`. Reverse mode propagates the adjoint of
-the ray that sees the edge back along the records of the path. Forward mode propagates the tangent of the camera ray to
-the edge.
+the ray towards the edge back to the camera, along the records of the path. Forward mode propagates the tangent of the
+camera ray to the edge.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class FilmDomain(Protocol):
     def flows(self, s: mi.Point2f) -> mi.Bool:
         """Return whether the camera ray through a film position may move under the film flow.
 
-        If the ray moves, the edges of static surfaces move relative to the ray.
+        The film flow is a velocity field of film positions. If the ray moves, the edges of static surfaces move
+        relative to the ray.
         """
 
     def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
@@ -107,8 +108,8 @@ def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spe
     with dr.resume_grad():
         ray, _ = film.ray(path.s, path.key)
         if dr.grad_enabled(ray.o, ray.d):
-            # Each camera parameter has a separate sum over these values. Without evaluation, every sum would repeat the
-            # search.
+            # Each camera parameter has a separate sum over these values. If the values were not evaluated here, every
+            # sum would repeat the search.
             dr.eval(q, path.s, path.key)
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
 
@@ -138,7 +139,7 @@ def ray_to_camera(
     lost: NonFiniteCounter,
     rays_only: bool = False,
 ) -> RayDerivative:
-    """Propagate the adjoint ``q`` of the ray that sees the edge back to the camera ray.
+    """Propagate the adjoint ``q`` of the ray towards the edge back to the camera ray.
 
     With ``rays_only`` no parameter receives a gradient.
     """

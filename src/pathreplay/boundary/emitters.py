@@ -3,12 +3,12 @@
 Segments lie in a unit square. For most emitters this is the square of their random numbers. Two kinds differ:
 
 - A sphere samples directions in polar coordinates. Close to the pole, straight edges have unbounded curvature in these
-  coordinates, which segments cannot resolve. The square is therefore mapped to a disk first.
+  coordinates, and segments cannot resolve them. The square is therefore mapped to a disk first.
 - The samples of a mesh are discontinuous where they change from one triangle to the next. The square is therefore
   mapped to the cone of directions around a bounding sphere of the mesh.
 
-Both maps are uniform. The maps do not change the motion of directions: when the scene moves, a direction follows its
-sampled point on the emitter, as in the interior term.
+Both maps preserve areas up to a constant factor. They do not affect the motion of directions: when the scene moves, a
+direction follows its sampled point on the emitter, as in the interior term.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def sample_at(trace: TraceConfig, emitter: SampledEmitter, u: mi.Point2f) -> mi.
 
 
 def direction(emitter: SampledEmitter, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-    """Map u to a direction in the cone from o around the bounding sphere, and return the cone's solid angle as well.
+    """Map u to a direction in the cone from o around the bounding sphere; also return the cone's solid angle.
 
     If o is inside the sphere, the cone contains all directions. Differentiable in u.
     """
@@ -269,7 +269,10 @@ class ShadowCrossing:
         return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, dark.hit, dark.ray, self.active))
 
     def weighted(self, w: mi.Vector2f, u_lit: mi.Point2f) -> ShadowCrossing:
-        """Replace the weight (the jump along ``w``) by the `crossing_weight`; ``u_lit`` is the end on the lit side."""
+        """Replace the weight by the `crossing_weight`.
+
+        The weight so far is the jump along ``w``. ``u_lit`` is the end of the interval on the lit side.
+        """
         observer, dark = self.segment.observer, self.dark
         at = observer.moved(observer.at.ray)
         slope = derivative_by_place(self.u, lambda u: self._gap(at, u))

@@ -21,7 +21,10 @@ from pathreplay.transport.volume.passage import skip_null
 
 @dataclass
 class ShadowTest:
-    """Whether a light reaches a point, which may be occluded or outside a projector's image or a spot's cone."""
+    """Result of a shadow test, i.e. whether a light reaches a point.
+
+    A point is dark if it is occluded, outside a projector's image, or outside a spot's cone.
+    """
 
     u: mi.Point2f  # random numbers that select the light
     lit: mi.Bool  # a light was sampled, and it has no extent
@@ -34,7 +37,7 @@ class ShadowTest:
 
     @staticmethod
     def of(trace: TraceConfig, at: Arrival, sampler: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
-        """Test whether a path's k-th vertex receives light from its emitter sample; ``sampler`` is at this vertex."""
+        """Test whether a path's k-th vertex receives light from its emitter sample; ``sampler`` is positioned there."""
         u = VertexSamples.draw(sampler).light
         si = at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
         test = ShadowTest.at(trace, si, u, _scatters(trace, si, k, active))

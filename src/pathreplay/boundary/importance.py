@@ -1,8 +1,8 @@
 """Importance of a segment, estimated from its probes: it determines which segments are bisected, but adds no bias.
 
-An edge at distance r turns by 1 / r per unit of motion, and the integrand jumps at the edge by a fraction of the
-scattered radiance. The radiance of a visible surface is unknown before a path is traced. Instead, a factor of the
-importance is 1 for the sky, and `DIM` for any surface.
+The direction to an edge at distance r turns by 1 / r per unit of motion, and the integrand jumps at the edge by a
+fraction of the scattered radiance. The radiance of a visible surface is unknown before a path is traced. It is
+therefore replaced by a factor, which is 1 for the sky and `DIM` for any surface.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ WITHIN = 2.0
 DIM, OWN = 0.3, 0.1
 """Factors of the importance: DIM if no sky is visible, OWN if the plane of the observer's own triangle is the edge."""
 UNFORESEEN = 0.1
-"""Weight of an edge's presence, added to its importance: probes do not predict every large contribution."""
+"""Weight with which the presence of an edge is added to its importance, because probes do not predict every large
+contribution."""
 MOST = 4.0
 """Largest importance of a pilot segment, relative to the mean. It is bounded because there are few pilot segments."""
 STEEP = 0.03
-"""Angle in radians added to the angle of an emitter across its square, to bound the importance of small emitters."""
+"""Angle in radians per unit length of a segment in an emitter's square. It is added to the angle that the segment
+subtends, to bound the importance of small emitters."""
 
 
 @dataclass
@@ -34,7 +36,7 @@ class Importance:
 
     presence: mi.Float  # see `Survey`
     edges: mi.Float  # importance of the edges
-    light: mi.Float  # scattered radiance, from emitters or from arcs
+    light: mi.Float  # scattered radiance of an emitter sample, or scattering weight of an arc
 
     @staticmethod
     def of(survey: Survey, light: mi.Float, scale: mi.Float) -> Importance:
@@ -48,7 +50,7 @@ def _finite(x: mi.Float) -> mi.Float:
 
 
 def closeness(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Float:
-    """Return 1 / r, the turn of the direction to a hit per unit of its motion, bounded by `WITHIN`; 0 on a miss."""
+    """Return 1 / r, the rotation of the direction to a hit per unit of motion, bounded by `WITHIN`; 0 on a miss."""
     shape = dr.reinterpret_array(mi.UInt32, hit.shape)
     h0 = dr.gather(mi.Float, trace.traits.tables.blend_lengths, shape, hit.is_valid())
     return dr.select(hit.is_valid(), dr.rcp(hit.t + WITHIN * h0), 0)
@@ -60,13 +62,13 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
 
 
 def radiance_of(importances: list[Importance]) -> mi.Float:
-    """Estimate the mean radiance along arcs: total scattered emitter light over total scattering weight of the arcs."""
+    """Estimate the mean radiance along arcs: scattered light of emitter samples over scattering weight of arcs."""
     from_emitters, total = (dr.sum(importance.light) for importance in importances)
     return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
 
 
 def weighed(importances: list[Importance], radiance: mi.Float) -> list[mi.Float]:
-    """Return two arrays, presence and importance of edges. Each has sum 1; segments in squares precede arcs."""
+    """Return presence and importance of edges as two arrays with sum 1. Segments in emitter squares precede arcs."""
     in_squares, on_arcs = importances
     presence = dr.concat([in_squares.presence, on_arcs.presence])
     importance = dr.concat([in_squares.edges, radiance * on_arcs.edges])

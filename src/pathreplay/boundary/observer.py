@@ -28,11 +28,12 @@ from pathreplay.transport.volume.media import carried, span
 from pathreplay.transport.volume.passage import further, skip_null, transmittance_past_edge, transmittance_up_to
 
 NEAR = 10.0
-"""Smallest usable distance of an edge, in offsets of ray origins. An offset then turns a ray by at most 0.1 radians."""
+"""Smallest usable distance of an edge, in units of the offset of ray origins. The offset then turns a ray by at most
+0.1 radians."""
 
 
 def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool, mi.Spectrum]:
-    """Return the lanes whose vertex scatters smoothly, and the weight of the flight before it (Spectrum)."""
+    """Return the lanes whose vertex has a smooth lobe or is in a medium, and the weight of the flight (Spectrum)."""
     if trace.media is None:
         return surface_sees(trace, at), mi.Spectrum(1)
     flight = step.kept.media.flight
@@ -40,7 +41,7 @@ def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool
 
 
 def surface_sees(trace: TraceConfig, at: Arrival) -> mi.Bool:
-    """Return the lanes whose path arrived at a surface that scatters smoothly."""
+    """Return the lanes whose path arrived at a surface with a smooth lobe."""
     valid = at.hit.is_valid()
     return valid & is_smooth(shape_met(trace, at.hit, at.ray, valid).bsdf())
 
@@ -63,11 +64,11 @@ class SelectedVertex:
 def choose_vertex(
     trace: TraceConfig, sampler: CounterSampler, ray: mi.Ray3f, flows: mi.Bool, layout: Layout | None, records: Any
 ) -> tuple[Any, SelectedVertex]:
-    """Trace a camera path, and select one of its smoothly scattering vertices in proportion to the throughput.
+    """Trace a camera path, and select one of the vertices that `may_see` an edge, in proportion to the throughput.
 
-    Where ``flows`` (see `FilmDomain`), the camera ray may move, and all vertices count as moving. Vertices are written
-    to ``records`` unless ``records`` is None. The last vertex that ``trace`` allows scatters no light, and is therefore
-    not traced.
+    In lanes with ``flows`` (see `FilmDomain`), the camera ray may move, so that all vertices count as moving. Vertices
+    are written to ``records`` unless ``records`` is None. The last vertex that ``trace`` allows scatters no light, and
+    is therefore not traced.
     """
     trace = replace(trace, max_depth=max(trace.max_depth - 1, 0))
     path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)))
@@ -124,7 +125,7 @@ class ObserverVertex:
             # With a given flight, no random numbers are needed, and the sampler may be None.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # fixed directions can cross creases
+        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # creases can cross fixed directions
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
         """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium: see `fly_again`."""
@@ -157,7 +158,7 @@ class ObserverVertex:
         return d, active & (pdf > 0) & ~delta
 
     def may_scatter(self, d: mi.Vector3f) -> mi.Bool:
-        """Return whether light from ``d`` may be scattered: ``d`` is on the viewer's side, or the BSDF transmits."""
+        """Return whether light from ``d`` may be scattered: ``d`` is on the incident side, or the BSDF transmits."""
         above = mi.Frame3f.cos_theta(self.si.to_local(d)) * mi.Frame3f.cos_theta(self.si.wi) > 0
         both = above | mi.has_flag(self.si.bsdf().flags(), mi.BSDFFlags.Transmission)
         return both if self.trace.media is None else both | self.event
@@ -235,7 +236,10 @@ class ObserverVertex:
     def transmittance_past_edge(
         self, light: mi.DirectionSample3f, t: mi.Float, key: mi.UInt32, active: mi.Bool
     ) -> mi.Spectrum:
-        """Estimate the transmittance to an emitter sample past an edge at ``t``; zero if emitters are not sampled."""
+        """Estimate the transmittance to an emitter sample past an edge at distance ``t``.
+
+        The result is zero if the medium does not use emitter sampling.
+        """
         if self.trace.media is None:
             return mi.Spectrum(1)
         needed = active & (~self.event | self.at.medium.use_emitter_sampling())

@@ -1,4 +1,4 @@
-"""Edges between surfaces, seen from a vertex in the directions in which it scatters.
+"""Edges between surfaces, seen from a vertex in directions that its BSDF or phase function samples.
 
 Segments are arcs (see `arcs`). Different surfaces, or different sheets of one surface, are visible at the ends of an
 arc. The edge between them is an outline, a crease or the boundary of a hard shadow.
@@ -62,7 +62,8 @@ class ArcSegment(Arc):
         facets = close & ~observer.keeps_direction & jumps_at_facets(lengths, observer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         near = closeness(trace, seen)
-        if trace.media is not None:  # directions also follow null boundaries, whose outlines are then edges
+        if trace.media is not None:
+            # Directions also follow hit points on null boundaries, whose outlines are therefore edges.
             boundary = place_met(trace, first, active, shape_met(trace, first, ray, active), facets=False)
             place, moves = mixed(place, boundary), moves | may_move(trace, first)
             near = dr.maximum(near, closeness(trace, first))
@@ -71,7 +72,7 @@ class ArcSegment(Arc):
             place, moves = mixed(place, dr.select(shade.dark, mi.UInt32(1), 0)), moves | may_move(trace, shade.hit)
         bright = dr.select(seen.is_valid(), DIM, mi.Float(trace.scene.environment() is not None))
         probe = VisibilityProbe(mixed(place, turned), at.p, at.n, moves, near, bright)
-        # Signature 1, since 0 stands for the sky.
+        # The signature is 1, because 0 denotes the sky.
         dark = replace(VisibilityProbe.of(1), moves=moves, near=near, bright=bright)
         return dr.select(counts, probe, dark)
 
@@ -151,7 +152,7 @@ class Side:
 
 @dataclass
 class OcclusionEdge:
-    """An edge that a vertex sees between two directions; the normal ``n`` points from the near to the far direction."""
+    """An edge between two directions from a vertex. Its normal ``n`` points from the near to the far direction."""
 
     observer: ObserverVertex
     near: Side

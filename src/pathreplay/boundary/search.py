@@ -35,13 +35,13 @@ Segments = TypeVar("Segments")
 
 @dataclass(frozen=True)
 class EdgeSearch(ABC, Generic[Segments]):
-    """Template of an edge search. A domain defines its segments, their edge detection, and the weights of edges."""
+    """Template of an edge search. A subclass per domain defines segments, edge detection, and weights of edges."""
 
     trace: TraceConfig
     film: FilmDomain
     density: SegmentDensity  # density of the film positions of paths
 
-    bisection: ClassVar[Stream]  # random stream that selects among the crossings of one segment
+    bisection: ClassVar[Stream]  # random stream for the choice among the crossings of one segment
 
     def find(self, n: int, resolved: int, seed: mi.UInt32) -> Edges:
         """Probe ``n`` segments, resample ``resolved`` of them by importance, and return their edges. Detached."""
@@ -53,7 +53,7 @@ class EdgeSearch(ABC, Generic[Segments]):
         return search.resolve(search.draw(chosen.index, n, seed), weight, generator)
 
     def guided(self, n: int, seed: mi.UInt32) -> EdgeSearch[Segments]:
-        """Return a search whose density a pilot pass has refined; without a pilot pass, this search."""
+        """Return a search with a density that a pilot pass has refined, or this search if there is no pilot pass."""
         return self
 
     @abstractmethod
@@ -68,7 +68,7 @@ class EdgeSearch(ABC, Generic[Segments]):
     def resolve(self, segments: Segments, weight: mi.Float, generator: mi.PCG32) -> Edges:
         """Locate edges on the segments by bisection, compute their weights, and record the paths to the edges.
 
-        ``weight`` is the weight of each lane in the mean over all segments; lanes of weight zero return no edge.
+        ``weight`` is the weight of each lane in the mean over all segments; lanes of weight zero have no edge.
         """
 
 

@@ -1,7 +1,7 @@
 """Secondary boundary term: edges seen from surface points and medium events, in direct shadows and in indirect light.
 
 At a scattering vertex x, light arrives from a direction ω. When parameters change, the interior term moves ω with a
-velocity V. An emitter sample keeps its random numbers u. Any other sample follows its hit point, to the degree φ (see
+velocity V. An emitter sample keeps its random numbers u. Any other sample follows its hit point with weight φ (see
 `velocity`). In narrow lobes, a sample keeps its direction instead (see `keeps_direction`). At an edge, the integrand
 jumps from f_near to f_far. The boundary term of the scattered radiance J contains the motion of the edge relative to V:
 
@@ -44,9 +44,9 @@ class CameraPath:
     """A camera path to a vertex, which has two segments: one in the unit square of emitter samples, and one arc."""
 
     s: mi.Point2f  # film position
-    density: mi.Float  # of s, per pixel
+    density: mi.Float  # density of ``s``, per pixel
     key: mi.UInt32  # seed of the path's random numbers
-    on_arc: mi.Bool  # whether the lane bisects the arc or the segment in the square
+    on_arc: mi.Bool  # whether the lane bisects the arc instead of the segment in the square
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
     def _particle(
         self, s: mi.Point2f, ray: mi.Ray3f, segment: BeamSegment, active: mi.Bool
     ) -> tuple[EdgePath, ObserverVertex]:
-        """Record the path through null boundaries to the medium point; return the path, and the point as observer."""
+        """Record the path through null boundaries to the medium point; return the path and the observer there."""
         trace, layout, τ = self.trace, Layout.of(self.trace, True), segment.τ
         records = dr.alloc_local(record_type(layout), room_for(trace))
         sampler = CounterSampler.of(segment.key)

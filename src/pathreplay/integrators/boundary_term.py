@@ -28,10 +28,10 @@ from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
 FILM_CLOSER, INNER_CLOSER = 5, 16
-"""Ratio of probed to bisected segments, in searches on the film and in secondary searches."""
+"""Number of probed segments per bisected segment, in searches on the film and in secondary searches."""
 GRID = "SDFGrid"
-"""Class of shapes whose silhouettes cannot be sampled: rays do not hit the points near the outline, and these points
-cannot be kept fixed on the surface."""
+"""Class of shapes whose silhouettes cannot be sampled. Rays miss them near the outline, and points on them cannot be
+kept at fixed surface coordinates."""
 BATCH = "BatchSensor"
 """Class of sensors whose rays cannot be differentiated with respect to film position: Dr.Jit terminates the process."""
 FILM_LENGTH = 0.5  # length of segments on the film, in pixels
@@ -40,7 +40,7 @@ INNER_LENGTHS = 0.25, 0.1  # length of segments in the unit square of emitter sa
 
 @dataclass(frozen=True)
 class Boundary:
-    """The boundary term of edges visible from the camera, from surfaces or from points in media.
+    """The boundary term, for edges visible from the camera, from surfaces or from points in media.
 
     The camera may see an edge directly, in mirrors or through glass. Not differentiated: edges in textures and masks;
     alpha; in scenes with media, hard shadows after the first scattering vertex.
@@ -133,13 +133,16 @@ def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
     if n > MOST_SAMPLES:
         raise PathreplayError(
             f"boundary_spp = {spp} with a film of {pixels} pixels are {n} segments, more than the {MOST_SAMPLES} that "
-            f"Dr.Jit takes at once; take boundary_spp up to {MOST_SAMPLES // pixels}, or 0"
+            f"Dr.Jit can process at once; take boundary_spp up to {MOST_SAMPLES // pixels}, or 0"
         )
     return max(n, 1)
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Return the sensors that count as static. Without film flow, the sensor of the pass does not count as static."""
+    """Return the sensors that count as static.
+
+    The sensor of the pass counts as static only with a film flow: `FilmDomain.flows` then marks the rays that move.
+    """
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 
 

@@ -1,4 +1,4 @@
-"""A pass over an image: scene, sensor, seed and samples per pixel, from which the pass generates camera rays."""
+"""A rendering pass, defined by scene, sensor, seed and samples per pixel. It generates the camera rays."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Rays:
     """The camera rays of a pass, one per sample of each pixel."""
 
     sampler: Sampler  # positioned after the dimensions of the camera ray
-    ray: mi.RayDifferential3f  # attached to the camera, if that has gradients
+    ray: mi.RayDifferential3f  # attached to the camera, if the camera has gradients
     weight: mi.Spectrum
     position: mi.Vector2f  # film position in pixels, where the sample is splatted
     spp: int  # samples per pixel of the pass, after rounding by the sampler
@@ -148,7 +148,7 @@ class Pass:
         return seed
 
     def pixel_samples(self, pixel: mi.UInt32) -> PixelSamples:
-        """Create the samples for lanes that each trace all paths of one pixel; ``pixel`` is a row-major index."""
+        """Create the samples for lanes that each trace all paths of a pixel. ``pixel`` contains row-major indices."""
         if self.uses_sobol:
             width, _ = self.size
             return SobolSets(partial(self.sobol_sampler, pixel, width))

@@ -1,4 +1,4 @@
-"""Messages about a pass: paths that lost a part of their gradient, and causes of wrong gradients."""
+"""Messages about a pass: paths with an incomplete gradient, and causes of wrong gradients."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pathreplay.platform import compat
 from pathreplay.transport.vertex import TraceConfig
 
 COST_OF_EDGES = (
-    "edges move with the parameters (silhouettes, shadows, borders of lights) and are differentiated in a pass of "
-    "their own, which may take several times as long as the rest: boundary = 'none' of the integrator leaves them out, "
-    "boundary = 'primary' only edges that the camera does not see; see docs/boundary.md"
+    "edges move with the parameters (silhouettes, shadows, borders of lights) and are differentiated in a separate "
+    "pass, which may take several times as long as the rest: boundary = 'none' of the integrator leaves them out, and "
+    "boundary = 'primary' leaves out the edges that the camera does not see; see docs/boundary.md"
 )
 """Message about the cost of boundary terms that were enabled by default."""
 
 
 def lost_note(lost: int, paths: int) -> str:
-    """Format the message about paths that lost a part of their gradient."""
+    """Format the message about paths with an incomplete gradient."""
     why = "a ray adjoint was not finite, or a ray crosses more boundaries of media than the record holds"
     return f"{lost / paths:.2%} of the paths lost a part of their gradient: {why}"
 
@@ -28,8 +28,8 @@ def lost_note(lost: int, paths: int) -> str:
 def used_before_note(seed: int) -> str:
     """Format the message about a pass that has already contributed to the control variate."""
     return (
-        f"seed {seed} was used before: a pass must not use a baseline that it contributed to, so it uses none; "
-        "give every pass a seed of its own"
+        f"seed {seed} was used before: a pass must not use a control variate that was learned from the same seed, so "
+        "this pass uses none; give every pass its own seed"
     )
 
 
@@ -47,7 +47,7 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
     if traits.masks_mirrors:
         yield (
             "a mask covers delta lobes, which Mitsuba then cannot sample one by one: derivatives with respect to "
-            "parameters of their probabilities (an index, or a reflectance of plastic) are wrong"
+            "parameters that change their probabilities (an index of refraction, a reflectance of plastic) are wrong"
         )
     if trace.media is not None and trace.media.passes and traits.opacity_moves:
         yield (
@@ -75,9 +75,8 @@ def particle_notes(trace: TraceConfig, sensor: mi.Sensor) -> Iterator[str]:
     moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
     if moving:
         yield (
-            f"'{moving[0]}' moves, and light paths leave out moving edges (outlines and shadows that light from "
-            "emitters meets, or that hide it from the sensor): measure the error with 'pathreplay check'; see "
-            "docs/particles.md"
+            f"'{moving[0]}' moves, and the gradient of light paths leaves out moving edges (changes of visibility "
+            "between emitters, surfaces and sensor): measure the error with 'pathreplay check'; see docs/particles.md"
         )
 
 

@@ -106,9 +106,10 @@ class PathReplayIntegrator(PathIntegrator):
     Without motion, no boundary term is computed for any value of ``boundary``.
 
     Gradients of media use a control variate that this integrator learns from earlier gradient passes with other seeds.
-    ``null_branching`` traces one more path from a null collision, as if the medium had scattered there. Without null
+    ``null_branching`` traces one more path from a null collision, as if the path had been scattered there. Without null
     branching, the gradient with respect to extinction is wrong where extinction is zero. ``auto`` branches if
-    extinction with gradients varies in space or is zero. Branching then usually takes less time at equal noise, too.
+    extinction with gradients varies in space or is zero. In these cases, branching usually also takes less time at
+    equal noise.
 
     Not differentiated: visibility that ``boundary`` leaves out; with ``attach='none'``, all motion of shapes, cameras
     and directions; without ``null_branching``, extinction where it is zero; with ``adjoint='replay'``, weights that are
@@ -117,13 +118,13 @@ class PathReplayIntegrator(PathIntegrator):
     """
 
     name = "pathreplay"
-    without_light_paths = "take caustics = 'camera'"  # remedy where light paths are not supported
+    without_light_paths = "take caustics = 'camera'"  # remedy in error messages, if light paths are not supported
     interior: PathReplay
 
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
         self.attach = choice(props, self.name, "attach", "delta", ATTACH)
-        self.moves_rays = self.attach != "none"  # whether cameras and positions of emitters receive gradients
+        self.moves_rays = self.attach != "none"  # whether parameters that move cameras and emitters receive gradients
         self.interior = _interior(self.name, props, self.max_depth)
         self.adjoint, self.null_branching = self.interior.adjoint, self.interior.branch
         self.uses_sobol = choice(props, self.name, "sampling", "sobol", SAMPLING) == "sobol"
@@ -144,7 +145,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The interior and boundary terms; `_planned` adds a term for the motion of film positions."""
+        """The interior and boundary terms. `_planned` may add a term for the motion of film positions."""
         if self.boundary == "none":
             return (self.interior,)
         return self.interior, Boundary(inner=self.boundary != "primary", spp=self.boundary_spp)
@@ -160,7 +161,7 @@ class PathReplayIntegrator(PathIntegrator):
         return view
 
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
-        """Build the trace configuration of camera paths, without caustics if light paths add these."""
+        """Build the trace configuration of camera paths. Caustics are omitted if light paths estimate them."""
         trace = PathIntegrator._trace_config(self, scene, sensor, state)
         if self.particles is None:
             return trace
@@ -177,7 +178,7 @@ class PathReplayIntegrator(PathIntegrator):
     def _backward(
         self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None
     ) -> TermResult:
-        """Back-propagate through all terms. A parameter may reach only camera paths, or only light paths."""
+        """Back-propagate through all terms. Some parameters affect only camera paths, others only light paths."""
         if self.particles is None:
             return PathIntegrator._backward(self, terms, part, trace, grad_in, learned)
         unreached, results = [], []
@@ -269,8 +270,8 @@ class PathReplayIntegrator(PathIntegrator):
         """Render an image and back-propagate a loss with derivative offset + slope · image, in one pass.
 
         The interior term evaluates the loss derivative of a path from the other sample sets of its pixel (see
-        `pixel_sweep`). The boundary term evaluates the loss derivative from the image. For what is not differentiated,
-        see `sweep`. Warns like `render_backward`. Requires `supports_pixel_sweep`.
+        `pixel_sweep`). The boundary term evaluates the loss derivative from the image. The documentation of `sweep`
+        states what is not differentiated. Warns like `render_backward`. Requires `supports_pixel_sweep`.
 
         Args:
             scene: the scene, without media.
@@ -278,7 +279,7 @@ class PathReplayIntegrator(PathIntegrator):
             slope: linear part of the loss derivative, in the shape of the returned image.
             sensor: a sensor, or its index in the scene.
             seed: seed of the random numbers.
-            spp: samples per pixel; 0 means those of the sensor's sampler.
+            spp: samples per pixel; 0 means the sample count of the sensor's sampler.
             pixels: distinct row-major indices of n pixels. If given, only these pixels are rendered and contribute to
                 the loss.
 
@@ -333,7 +334,7 @@ class PathReplayIntegrator(PathIntegrator):
         return replace(state, guess=learned.guess, passes=learned.passes)
 
     def keep(self, scene: mi.Scene, state: PassState) -> None:
-        """Log lost paths, and learn from the results. Does nothing in a user's recording, which cannot read results."""
+        """Warn of incomplete gradients, and update the learned state. Does nothing while `dr.freeze` records."""
         if is_recording():
             return
         result = state.result
@@ -377,7 +378,7 @@ class PathReplayIntegrator(PathIntegrator):
         self.baseline = ref(facts_of(scene)), baseline
 
     def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
-        """Log a note about moving edges whose boundary term is left out: see `PathIntegrator`."""
+        """Log a note if edges move and their boundary term is left out: see `PathIntegrator`."""
         if self.particles is not None and result.moves:
             for note in particle_notes(trace, view.sensor):
                 self._warn_once(note)
@@ -397,7 +398,7 @@ class PathReplayIntegrator(PathIntegrator):
             mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
     def options(self) -> Json:
-        """Return the properties of this integrator, except the ones that all path integrators share."""
+        """Return the properties of this integrator, except for the properties of `PathIntegrator`."""
         return {
             "adjoint": "auto" if self.interior.auto else self.adjoint,
             "attach": self.attach,

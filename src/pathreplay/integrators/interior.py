@@ -36,7 +36,7 @@ def image(view: Pass, trace: TraceConfig) -> mi.TensorXf:
 def tangent(view: Pass, trace: TraceConfig, driver: ForwardDriver) -> TermResult:
     """Compute the tangent of the image with a driver.
 
-    If paths move with the parameters, also count the paths that lose a part of their gradient.
+    If paths move with the parameters, also count the paths with an incomplete gradient.
     """
     rays, lost = view.rays(), NonFiniteCounter()
     δL, valid, moves = driver(trace, rays.start, lost)
@@ -50,7 +50,7 @@ def tangent(view: Pass, trace: TraceConfig, driver: ForwardDriver) -> TermResult
 def back_propagate(view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, driver: Driver) -> TermResult:
     """Back-propagate the adjoint of the image with a driver.
 
-    If paths move or the scene has media, also count the paths that lose a part of their gradient.
+    If paths move or the scene has media, also count the paths with an incomplete gradient.
     """
     rays, lost = view.rays(), NonFiniteCounter()
     δL, paths = adjoint(view, rays, grad_in), dr.width(rays.ray)
@@ -69,7 +69,7 @@ class PathReplay:
     """
 
     adjoint: str  # recorded (`sweep`) or replay
-    auto: bool  # allows `replay` for paths too deep for a record, and `emission_only` if only emitters have gradients
+    auto: bool  # use `replay` for paths too deep for a record, and `emission_only` if only emitters have gradients
     branch: str | bool  # whether each path branches at one null collision (auto: if the media require it)
     recovery: Recovery  # regularisation of `replay`
 

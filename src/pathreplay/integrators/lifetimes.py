@@ -4,8 +4,8 @@ Mitsuba registers every scene object with Dr.Jit. Dr.Jit traces a virtual functi
 including the objects of other scenes. Four rules follow, which this module enforces for all passes:
 
 1. No object outlives its scene. An area light has a raw pointer to its shape, and tracing the light after the shape is
-   freed crashes the process. Facts about a scene are therefore stored here together with the scene, and both are
-   released once nothing else references the scene. (`nodes` ensures that traversals leave no reference cycles.)
+   freed crashes the process. Stored facts about a scene contain its objects. They are therefore released together with
+   the scene, once nothing else references the scene. (`nodes` ensures that traversals leave no reference cycles.)
 2. No object is created or freed between two virtual function calls of one kernel. Otherwise Dr.Jit emits the same
    function twice ("invalid redefinition"). The cyclic garbage collector is therefore off during a pass, and scenes are
    released before the pass.
@@ -77,7 +77,7 @@ SCENES: SceneMemory = SceneMemory()
 """Facts about the scenes of this process, released according to the rules above."""
 _ONE_THREAD = threading.RLock()
 _AT_COLLECTION = threading.Lock()
-"""Marks that `_on_collection` may hold `_ONE_THREAD`: a pass then waits briefly instead of raising an error."""
+"""Locked while `_on_collection` may hold `_ONE_THREAD`. A pass then waits briefly instead of raising an error."""
 _passes = 0  # number of nested passes in progress
 _hidden = False  # whether objects are hidden from the collector
 

@@ -1,8 +1,9 @@
 """Split a pass of many samples into parts with their own seeds, and average the parts, weighted by their samples.
 
-Dr.Jit counts the samples of a kernel in 32 bits, but single precision limits sums much earlier. A sum of n equal
-numbers, added one by one, has a relative error of up to n 2^-25, and stops growing at n = 2^24. Dr.Jit first sums
-packets of 16 samples. The packets are then added one by one, both to a pixel and to the gradient of a scalar.
+Dr.Jit counts the samples of a kernel in 32 bits, but single precision limits the accuracy of sums at much smaller
+counts. A sum of n equal numbers, added one by one, has a relative error of up to n 2^-25, and stops growing at n =
+2^24. Dr.Jit first sums packets of 16 samples. The packets are then added one by one, both to a pixel and to the
+gradient of a scalar.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from pathreplay.platform.traversal import known_values
 from pathreplay.scenes.parameters import SceneValue, is_transform
 
 # Largest number of samples of a pass that is not split. If all samples contribute equally, the relative rounding error
-# of a scalar's gradient is then below 1e-2. Otherwise this error is far below the noise of the gradient.
+# of a scalar's gradient is then below 1e-2. If the contributions differ, this error is far below the noise of the
+# gradient.
 MOST_AT_ONCE = 2**24
 # Samples of a part of a split pass. The relative rounding error of a scalar's gradient is 1.3e-3. A part takes a few
 # tenths of a second; the time to trace its kernel again is negligible in comparison.
@@ -32,22 +34,23 @@ A_PART = 2**22
 MOST_A_PIXEL = 2**16
 # Smallest number of samples per pixel in a part with many pixels: with fewer, the work on the film would be noticeable.
 LEAST_A_PIXEL = 4
-# Largest number of samples of one call: minutes on current machines. Calls show no progress and cannot be interrupted.
+# Largest number of samples of one call. A call of this size takes minutes on current machines. Calls show no progress
+# and cannot be interrupted.
 MOST_IN_ALL = 2**36
 
 
 def parts(view: Pass) -> list[Pass]:
     """Split a pass of many samples into parts with weights ``share``; the first part keeps the seed.
 
-    Returns the pass itself if it needs no split.
-    Raises PathreplayError if Dr.Jit cannot count one sample per pixel, or for more than `MOST_IN_ALL` samples.
+    Returns the pass itself if it needs no split. Raises PathreplayError for films with more than `MOST_SAMPLES` pixels,
+    and for more than `MOST_IN_ALL` samples.
     """
     width, height = film_size(view.sensor)
     pixels = width * height
     if pixels > MOST_SAMPLES:
         raise PathreplayError(
             f"The film of sensor '{view.sensor.id()}' has {width} x {height} pixels, more than the {MOST_SAMPLES} "
-            "samples that Dr.Jit takes at once; make it smaller, or give it a crop window"
+            "samples that Dr.Jit can process at once; make it smaller, or give it a crop window"
         )
     if pixels * view.spp > MOST_IN_ALL:
         raise PathreplayError(
@@ -99,7 +102,7 @@ def summed(scene: mi.Scene, passes: Sequence[Pass]) -> Iterator[Callable[[], Non
     try:
         yield (lambda: None) if sums is None else sums.take
     finally:
-        if sums is not None:  # even after an error, because the sums include the gradients of earlier passes
+        if sums is not None:  # also after an error, because the sums include the gradients of earlier passes
             sums.give()
 
 

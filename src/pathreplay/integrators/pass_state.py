@@ -14,14 +14,15 @@ from pathreplay.transport.facts.traits import Tables
 class PassState:
     """State that a pass takes as input and returns with its results added.
 
-    `PathIntegrator.begin` creates a state; `PathIntegrator.keep` reports the results and learns from them. A function
-    that `dr.freeze` records takes the state as an argument, since it cannot inspect the scene on the host.
+    `PathIntegrator.begin` creates a state. `PathIntegrator.keep` logs warnings about the results, and updates what the
+    integrator has learned. A function that `dr.freeze` records takes the state as an argument, since it cannot inspect
+    the scene on the host.
     """
 
     tables: Tables | None = None
     """Lookup tables of the scene."""
     branches: bool | None = None
-    """`Media.branches`; None if the pass determines it."""
+    """`Media.branches`; None if the pass has to determine it."""
     guess: Baseline | None = None
     """Control variate for the radiance in media."""
     passes: frozenset[Hashable] = frozenset()

@@ -73,11 +73,11 @@ class PathIntegrator:
 
     name = ""
     attach = "none"
-    uses_sobol = False  # Owen-scrambled Sobol samples replace independent ones
-    boundary = "none"  # estimated boundary terms
+    uses_sobol = False  # whether Owen-scrambled Sobol samples replace independent samples
+    boundary = "none"  # boundary terms that are estimated
     baseline: object = None  # learned state
     interior: Term
-    max_depth: int  # this and the following are members of Mitsuba's integrator
+    max_depth: int  # this member and the next two belong to Mitsuba's integrator
     rr_depth: int
     skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
 
@@ -179,7 +179,7 @@ class PathIntegrator:
                     part, trace, terms = self._planned(part, state)
                     learned = self._learned(part, trace, state)
                     weighted = grad_in if part.share == 1 else grad_in * part.share
-                    with dr.isolate_grad():  # postpones traversal of the film flow, which the terms share, to the end
+                    with dr.isolate_grad():  # postpones traversal of the film flow, which all terms share, to the end
                         result = self._backward(terms, part, trace, weighted, learned)
                 self._log_notes(part, trace, result)
                 state = state.after(result)

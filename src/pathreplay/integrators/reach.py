@@ -1,4 +1,4 @@
-"""Sensors whose images depend on a parameter: all sensors, unless the parameter belongs only to certain sensors."""
+"""Find the sensors whose images can depend on a parameter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Facts about a scene. Its objects are collected once; every pass determines which of them have gradients."""
+"""Facts about a scene. Objects are collected once; every pass determines which objects have gradients."""
 
 from __future__ import annotations
 

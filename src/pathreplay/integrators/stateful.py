@@ -24,7 +24,7 @@ _PROJECTIVE = "Projective"
 
 @runtime_checkable
 class StatefulIntegrator(Protocol):
-    """An integrator whose passes take and return a `PassState`. See `PathIntegrator` for undocumented methods."""
+    """An integrator whose passes take and return a `PassState`. `PathIntegrator` documents the other methods."""
 
     @property
     def boundary(self) -> str:
@@ -69,7 +69,7 @@ class StatefulIntegrator(Protocol):
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None: ...
 
     def options(self) -> Json:
-        """Return the properties of an equivalent `pathreplay`, except the ones that all path integrators share."""
+        """Return the properties of an equivalent `pathreplay`, without the properties of `PathIntegrator`."""
 
 
 @dataclass(frozen=True)

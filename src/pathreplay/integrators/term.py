@@ -17,8 +17,8 @@ class TermResult:
     """Results of a term besides the gradients of parameters. Results of several terms or passes can be added."""
 
     image: mi.TensorXf | None = None  # tangent of the image (forward mode), or the image itself (pixel sweep)
-    stats: BaselineStats | None = None  # statistics of media, from which later passes learn
-    lost: mi.UInt32 | None = None  # number of paths that lost a part of their gradient, if counted
+    stats: BaselineStats | None = None  # radiance in media, from which the control variate of later passes is computed
+    lost: mi.UInt32 | None = None  # number of paths with an incomplete gradient; None if not counted
     paths: int = 0  # number of paths among which ``lost`` were counted
     moves: bool = False  # hit points, directions or emitter samples depend on parameters with gradients
 

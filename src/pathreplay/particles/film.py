@@ -21,7 +21,7 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.transport.sensor import METER
 
-STEPS = 4096  # of the midpoint rule for the integral of the filter
+STEPS = 4096  # number of steps of the midpoint rule for the integral of the filter
 
 
 @dataclass
@@ -41,12 +41,12 @@ class ParticleFilm:
     width: int
     height: int
     n: int  # pixels along one side of a footprint
-    meter: bool  # all contributions belong to one pixel
+    meter: bool  # the sensor is an irradiance meter, whose film has a single pixel
     mass: float  # integral of the filter over the film plane
 
     @staticmethod
     def of(sensor: mi.Sensor) -> ParticleFilm:
-        """Describe the film of a sensor. Raises PathreplayError if it stores other things than colours."""
+        """Describe the film of a sensor. Raises PathreplayError if it stores spectra instead of colours."""
         film = sensor.film()
         film.prepare([])
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
@@ -90,7 +90,7 @@ class ParticleFilm:
                 dr.scatter_add(sums, mi.Vector4f(value.x, value.y, value.z, 0), index, ok & inside)
 
     def gather(self, buffer: mi.Float, s: mi.Point2f, active: mi.Bool) -> mi.Color3f:
-        """Return Σ h(x - s) of the buffer at x, differentiably in s."""
+        """Return Σ h(x - s) A(x) over the pixels x, with A the ``buffer``; differentiable in s."""
         at, total = self.footprint(s), mi.Color3f(0)
         for column in range(self.n):
             for row in range(self.n):
@@ -106,7 +106,7 @@ class ParticleFilm:
         return mi.UInt32(y * self.width + x), (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
     def scale(self, number: int) -> float:
-        """Return the factor of the sum over ``number`` light paths that makes it an image."""
+        """Return the factor that converts a sum over ``number`` light paths to an image."""
         return self.pixels / (number * (1.0 if self.meter else self.mass))
 
     def develop(self, sums: mi.Float) -> mi.TensorXf:
@@ -137,7 +137,8 @@ class ParticleFilm:
         return buffer
 
 
-# Integrals of filters along a line, by their descriptions. A pass recorded by `dr.freeze` cannot compute them.
+# Integrals of filters along one axis, by the string representation of the filter. A pass recorded by `dr.freeze` cannot
+# compute them.
 _LENGTHS: dict[str, float] = {}
 
 

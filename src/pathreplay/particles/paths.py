@@ -1,8 +1,9 @@
 """Loops over light paths: the image, its tangent, and the sweep that back-propagates its adjoint.
 
 Each lane traces many light paths one after the other. Memory therefore does not depend on the number of light paths.
-The radiance throughput of a path is W_0 β, with W_0 the weight of its first ray. With A the adjoint of the image at the
-film, the derivative of a loss is that of Σ W_0 L_0, with L_i = A(s_i) c_i + w_i L_{i+1}.
+The radiance throughput of a path is W_0 β, with W_0 the weight of its first ray. Let A(s) be the adjoint of the image
+as a fixed function of film position. The derivative of a loss is then the derivative of Σ W_0 L_0, with L_i = A(s_i)
+c_i + w_i L_{i+1}.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ from pathreplay.transport.path import PathState
 from pathreplay.transport.sensor import SensorLink
 from pathreplay.transport.vertex import TraceConfig
 
-# Lanes that trace light paths at the same time.
+# Numbers of lanes that trace light paths at the same time, on CPUs and on GPUs.
 LANES = 2**16
 LANES_GPU = 2**20
 
 
 @dataclass(frozen=True)
 class Particles:
-    """``number`` light paths of a scene, a pure function of their key."""
+    """``number`` light paths of a scene. Their random numbers are a pure function of ``key``."""
 
     emission: Emission
     key: mi.UInt32
@@ -197,8 +198,8 @@ def particle_sweep(
 def link_of(trace: TraceConfig, sensor: mi.Sensor, caustics: bool) -> TraceConfig:
     """Return the configuration of light paths to a sensor.
 
-    A path of ``max_depth`` segments has one vertex less on a light path than on a camera path: neither the emitter nor
-    the sensor is a vertex. With ``caustics``, only the paths are kept that `TraceConfig.without_caustics` omits.
+    A light path of ``max_depth`` segments has ``max_depth`` - 1 vertices, because neither emitter nor sensor counts as
+    a vertex. With ``caustics``, only the paths that `TraceConfig.without_caustics` omits are traced.
     """
     link = replace(SensorLink.of(sensor), caustics=caustics)
     return replace(trace, to_sensor=link, max_depth=max(trace.max_depth - 1, 0), without_caustics=False)

@@ -1,4 +1,4 @@
-"""Start: the first ray of a light path, sampled from the emitters of a scene."""
+"""Start: sample the first ray of a light path from the emitters of a scene."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EMITTERS = frozenset(
 MAP = "EnvironmentMapEmitter"
 
 # Largest distance between the origin of a ray and the triangle that emitted it, in units of Mitsuba's offset of origins
-# along normals. Only rays along the triangle have a larger distance; they carry almost no flux.
+# along normals. Only rays nearly parallel to the triangle have a larger distance, and these carry almost no flux.
 CLOSE = 100
 
 
@@ -79,7 +79,7 @@ class Emission:
         return Emission(scene, sensor, tuple(weights), maps, tuple(filter(_has_smooth_mesh, emitters)))
 
     def pick(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-        """Return the index of an emitter, a random number that is independent of it, and its probability."""
+        """Select an emitter; return its index, a random number independent of the index, and its probability."""
         used = [weight for weight in self.weights if weight > 0]
         if min(used) == max(used):
             place = u * len(used)
@@ -102,8 +102,8 @@ class Emission:
     def emit(self, trace: TraceConfig, u: EmitterSamples, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Sample a ray and its weight: emitted radiance times cosine, over density. Differentiable in the emitters.
 
-        The point on a light has fixed coordinates there, and the direction is fixed in its frame. Both move with the
-        light.
+        The point has fixed coordinates on the emitter, and the direction has fixed coordinates in the local frame. Both
+        move with the emitter.
         """
         index, again, probability = self.pick(u.emitter)
         emitter = dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index, active)
@@ -155,17 +155,18 @@ def _origin(
 
 
 def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-    """Return 1 with the derivative of the log area of the emitting triangle, which Mitsuba omits (see `emitters`)."""
+    """Return a factor of value 1, with the derivative of the log area of the emitting triangle. Mitsuba omits it."""
     hit, back, on_mesh = _origin(trace, emitter, ray, active)
     area = dr.norm(surface_point(hit, back, on_mesh).A)
     return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)
 
 
 def _outwards(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-    """Return whether a ray leaves the outside of the mesh that emits it.
+    """Return whether a ray leaves its mesh emitter on the outside.
 
-    Mitsuba samples directions around the interpolated normal. Some of them point below the triangle, where the mesh
-    hides them from everything else. As Mitsuba offsets the origins to the outside, such rays would hit the mesh there.
+    Mitsuba samples directions around the interpolated normal. Some of these directions point below the triangle, so
+    that the mesh itself blocks the light. Such rays must be rejected, because Mitsuba offsets their origins to the
+    outside, and they would then hit the mesh.
     """
     hit, back, on_mesh = _origin(trace, emitter, ray, active)
     n = hit.compute_surface_interaction(back, compat.shading(), on_mesh).n
@@ -195,7 +196,7 @@ class EmitterStart:
         return self.emission.emit(self.trace, self.u, self.active)
 
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
-        """Find the first arrival, detached."""
+        """Intersect the rays with the scene. Nothing is differentiated."""
         ray, _ = dr.detach(self.emit())
         hit = meet(trace, ray, active)
         return Arrival(ray=mi.Ray3f(ray), hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))

@@ -17,7 +17,7 @@ the onset of total internal reflection are *not* differentiated (F is continuous
 the weight is f / detach(pdf). If both lobes are enabled, the value of the weight is the tint (times s for
 transmission), while its derivative contains the Fresnel term. Where the minimum of 1/4 applies, because F exceeds 3/4,
 the value has an additional factor: F / (3/4) for reflection and (1 - F) / (1/4) for transmission. If an edge of the
-scene is seen through a lobe, the motion of the edge is a boundary term, which belongs to the integrator.
+scene is visible through a lobe, the integrator has to add a boundary term for the motion of the edge.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def _index(props: mi.Properties, name: str, default: str) -> float:
 
 
 class DielectricAD:
-    """A smooth dielectric whose index of refraction is differentiable; a template, see `on_base`."""
+    """A smooth dielectric with differentiable index of refraction. `on_base` combines this template with `mi.BSDF`."""
 
     specular_reflectance: mi.Texture | None  # None: the tint is 1, and no texture is evaluated
     specular_transmittance: mi.Texture | None

@@ -22,16 +22,16 @@ from pathreplay.plugins.supergrid import Bounds
 
 T = TypeVar("T")
 
-#: Rate of residual collisions relative to the largest residual density. Compared with the value 1, the value 2 halves
-#: the exponent in the variance (see `control`). The value 4 costs more time than the lower noise saves (`pathreplay
-#: bench gridmedium`).
+#: Rate of residual collisions relative to the largest residual density. With 2 instead of 1, the exponent in the
+#: variance is half as large (see `control`). With 4, the additional collisions take more time than the lower noise
+#: saves (`pathreplay bench gridmedium`).
 DENSER = 2.0
 #: Largest value of ∫ (σ - c)²/m ds over one cell, if σ is the lowest density of the cell along the whole ray. This
-#: integral is about the relative variance that the cell adds to the transmittance (see `control`). A ray crosses 10 to
-#: 50 cells. With the mean as control density in all cells, dense grids with sharp edges produce extreme outliers.
+#: integral approximates the relative variance that the cell adds to the transmittance (see `control`). A ray crosses 10
+#: to 50 cells. With the mean as control density in all cells, dense grids with sharp edges produce extreme outliers.
 RISK = 0.1
-#: Russian roulette is applied to estimates below this value. The roulette adds a variance of at most FAINT times the
-#: transmittance.
+#: Russian roulette is applied to transmittance estimates below this value. It adds a variance of at most FAINT times
+#: the transmittance.
 FAINT = 1e-2
 
 
@@ -132,7 +132,8 @@ def begin(cells: Cells, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> CellWalk:
     offset = dr.select(still, dr.inf, (dr.select(forward, mi.Vector3f(1), mi.Vector3f(0)) - o) * inverse)
     inner = mi.Vector3f([n - 2 for n in cells.shape])
     start = dr.clip(dr.floor(dr.fma(d, a, o)), 1, inner)
-    # The ray ends at the far side of the last inner cell at the latest. The rounding is the same as in the traversal.
+    # The traversal ends at the far side of the last inner cell at the latest. This distance is rounded as in the
+    # traversal.
     last = dr.fma(dr.select(forward, inner, mi.Vector3f(1)), inverse, offset)
     stride = dr.select(forward, mi.Vector3f(1), mi.Vector3f(-1))
     return CellWalk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))
@@ -197,7 +198,7 @@ def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
 
     The relative variance of the transmittance is exp(∫ (σ - c)²/m ds) - 1. The mean density as c minimizes the integral
     on average. However, if a ray passes only through the lowest density of a cell, the integral over this cell can be
-    large. c is therefore limited, so that the integral over one cell does not exceed RISK for such a ray.
+    large. The value of c is therefore limited, so that the integral over one cell does not exceed RISK for such a ray.
     """
     lowest, highest = _scaled(bounds, scale)
     length = 2 / bounds.faces_per_length  # twice the mean length of a ray in a cell

@@ -32,13 +32,13 @@ from pathreplay.plugins.supergrid import (
     voxel_bounds,
 )
 
-#: Half the side of the cube that a `constvolume` fills if the density is given as a number. The value is larger than
-#: any scene, and far from overflow. Without a transform, a `constvolume` fills only the unit cube.
+#: Half the side of the cube that a `constvolume` fills if a property is given as a number. The cube is larger than any
+#: scene, and its coordinates do not overflow. Without a transform, a `constvolume` fills only the unit cube.
 FAR = 1e6
 
 
 class GridMedium:
-    """A heterogeneous medium on grids, with local majorants; a template, see `on_base`."""
+    """A heterogeneous medium on grids, with local majorants. `on_base` combines this template with `mi.Medium`."""
 
     phase_function: Callable[[], mi.PhaseFunction]  # a method of `mi.Medium`
 
@@ -201,7 +201,7 @@ def _choice(props: mi.Properties) -> bool | str:
 
 
 def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
-    """Return whether channels of a volume may differ, and bounds per cell size, from finest to a single cell."""
+    """Return whether the channels of a volume may differ, and its bounds for all cell sizes, from fine to coarse."""
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]
     if volume.class_name() == "GridVolume":

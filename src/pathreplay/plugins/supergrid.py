@@ -24,7 +24,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-#: Voxels along the side of the smallest cell. Half this size gives eight times as many cells, and twice as many steps.
+#: Number of voxels along the side of the smallest cell. With half this number, there would be eight times as many
+#: cells, and rays would take twice as many steps.
 BASE = 4
 #: Lowest, mean and highest value (TensorXf, z y x), one entry per voxel or cell.
 Values: TypeAlias = "tuple[mi.TensorXf, mi.TensorXf, mi.TensorXf]"
@@ -162,8 +163,8 @@ def _channels(data: mi.TensorXf) -> Values:
         return 3 * (mi.TensorXf(data.array, data.shape[:3]),)
     channels = [data[..., k] for k in range(data.shape[3])]
     if len(channels) == 4:
-        # Three channels are the coefficients of a spectrum, whose values are only known to be between 0 and 1. The
-        # fourth channel is a factor.
+        # The first three channels are coefficients of a spectrum, whose values are only known to be between 0 and 1.
+        # The fourth channel is a factor of the spectrum.
         return dr.fmin(channels[3], 0), channels[3] * 0, channels[3]
     return reduce(dr.fmin, channels), reduce(operator.add, channels) / len(channels), reduce(dr.fmax, channels)
 

@@ -13,8 +13,8 @@ STEPS = tuple(round(2**32 * (root % 1)) for root in ((1 + 5**0.5) / 2, 2**0.5))
 """Steps of the Kronecker lattice. Both steps and 1 are linearly independent over the rationals, so that pairs of
 coordinates also fill the square evenly."""
 ROUNDS = 8
-"""Rounds of the TEA cipher. With Mitsuba's default of 4, samples of neighbouring keys are correlated: shadows in
-two-bounce light were 4 % too weak."""
+"""Rounds of the TEA cipher. With Mitsuba's default of 4 rounds, samples of neighbouring keys are correlated, and
+shadows in two-bounce light were 4 % too weak."""
 
 
 @dataclass
@@ -49,7 +49,7 @@ class CounterSampler:
 
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
         x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # the two halves of a cipher block
-        self.index += 2  # a 2D sample uses two indices, so that a vertex uses six (see `at_vertex`)
+        self.index += 2  # with two indices per 2D sample, a vertex uses six indices (see `at_vertex`)
         return mi.Point2f(_in_unit(x), _in_unit(y))
 
 

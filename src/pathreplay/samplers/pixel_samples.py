@@ -12,7 +12,7 @@ from pathreplay.samplers.sampler import Sampler
 
 SETS = 4
 """Largest number of low-discrepancy sets per pixel; each set has at least one path. With fewer sets, the adjoint of a
-path depends on fewer independent paths. With more sets, the samples of a set are less evenly distributed."""
+path is computed from fewer paths and is noisier. With more sets, the samples of a set are less evenly distributed."""
 
 
 class PixelSamples(Protocol):

@@ -5,7 +5,7 @@ The value of a stream is used in one of four ways, as the comments in `Stream` s
 - It is combined with a seed or key, by exclusive or (`Stream.of`) or by a hash.
 - It is the first index of the stream in the sequence of a key (`CounterSampler.stream`). The lowest indices, from 0 on,
   belong to the path itself, with six samples per vertex (see `CounterSampler.at_vertex`).
-- It is added to the state of a generator.
+- It is added to the initial state of a generator.
 - It is hashed into the key of a Sobol sampler.
 """
 
@@ -42,7 +42,7 @@ class Stream(IntEnum):
     TRANSMITTANCE_PAST_EDGE = 0x60000
     TRANSMITTANCE_TO_EDGE = 0x70000
     TRANSMITTANCE_OF_BEAM = 0x80000
-    # Added to the state of the generator that chooses among the edges crossed by a segment.
+    # Added to the initial state of the generator that selects among the edges on a segment.
     BISECT_PRIMARY = 0
     BISECT_SECONDARY = 1
     BISECT_VOLUMETRIC = 2

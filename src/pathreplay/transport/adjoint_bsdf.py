@@ -18,17 +18,18 @@ from pathreplay.transport.arrive import Vertex
 
 
 def smooth_adjoint(v: Vertex, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-    """Return the weight, times density, of scattering into the local direction ``wo`` by smooth lobes (Spectrum)."""
+    """Evaluate F |ω_c·n_g| / |ω_l·n_g| for the smooth lobes, with ω_c the local direction ``wo`` (Spectrum)."""
     turned = mi.SurfaceInteraction3f(v.si)
     turned.wi = wo
     return v.bsdf.eval(mi.BSDFContext(), turned, v.si.wi, active) * _tilt(v, wo)
 
 
 def delta_adjoint(v: Vertex, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
-    """Return the factor of the weight of a delta lobe, which is sampled in importance mode.
+    """Return the factor by which the weight of a delta lobe sampled in importance mode must be multiplied.
 
     The normal at which the light is reflected or refracted is parallel to h = ω_l + η ω_c, with η the relative index of
-    refraction across the lobe. Refraction changes solid angles by the ratio of the cosines with h.
+    refraction across the lobe. The factor contains |h·ω_l| / |h·ω_c|: refraction changes solid angles by this ratio and
+    by a power of η, which importance mode omits.
     """
     cos = dr.dot(v.si.wi, wo)
     a, b = 1 + eta * cos, cos + eta  # h·ω_l and h·ω_c

@@ -31,7 +31,7 @@ class Vertex:
     origin: mi.Interaction3f  # origin of the rays that leave the vertex
     glow: mi.Spectrum  # radiance emitted towards the ray's origin, MIS weighted
     inside: InMedium = None  # type: ignore[assignment]  # None in scenes without media
-    n: mi.Vector3f = None  # type: ignore[assignment]  # differentiable geometric normal in the shading frame, on light paths
+    n: mi.Vector3f = None  # type: ignore[assignment]  # differentiable geometric normal in the shading frame; None on camera paths
 
 
 @dataclass
@@ -39,7 +39,7 @@ class InMedium:
     """The additional state of a vertex in a scene with media."""
 
     event: mi.Bool  # the flight ended at a real collision in the medium
-    through: mi.Bool  # the ray ended at a null boundary, which passes all light and does not count as a vertex
+    through: mi.Bool  # the ray ended at a null boundary, which transmits all light and does not count as a vertex
     mei: mi.MediumInteraction3f
     phase: mi.PhaseFunctionPtr
     flight: Flight
@@ -99,9 +99,10 @@ def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
 
 
 def sees_lights(trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Return the lanes whose ray sees emitters. With ``hide_emitters``, camera rays that leave the scene see none.
+    """Return the lanes in which emission along the ray is visible.
 
-    Without caustics, a delta lobe sees no emitter other than the environment if the path has scattered before.
+    With ``hide_emitters``, the environment is invisible to the camera. If caustics are omitted, only the environment is
+    visible along delta lobes of paths that have scattered before.
     """
     if trace.without_caustics:
         active = active & ~(at.delta & at.scattered & si.is_valid())

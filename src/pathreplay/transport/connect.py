@@ -38,7 +38,7 @@ class Connection:
 def choose(
     trace: TraceConfig, v: Vertex, medium: mi.MediumPtr, u: VertexSamples, sampler: Sampler, go_on: mi.Bool
 ) -> Connection:
-    """Sample an emitter, in lanes whose vertex can scatter light from emitter samples, and test visibility. Detached.
+    """Sample an emitter at vertices that support next-event estimation, and test visibility. Detached.
 
     With media, a shadow ray estimates the transmittance. ``medium`` is the medium through which the path arrived.
     """

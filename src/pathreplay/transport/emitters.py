@@ -31,9 +31,9 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
 def vertex_glow(
     trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool
 ) -> mi.Spectrum:
-    """Return the `emission` at a vertex, or zero if there is no area light and the caller adds the background.
+    """Return the `emission` at a vertex.
 
-    Light paths see no emission.
+    The result is zero on light paths. It is also zero if the caller adds the background and there are no area lights.
     """
     if trace.to_sensor is not None or (trace.background_apart and not trace.traits.area_lights):
         return mi.Spectrum(0)
@@ -41,7 +41,7 @@ def vertex_glow(
 
 
 def relight(trace: TraceConfig, at: Arrival, lighting: Lighting) -> mi.Spectrum:
-    """Evaluate emission plus next-event estimate of a vertex again (Spectrum); differentiable in emitted radiance."""
+    """Evaluate emission plus next-event estimate of a vertex again (Spectrum), differentiable in emitted radiance."""
     own = vertex_glow(trace, at, lighting.si, False, lighting.seen)
     return own + lighting.w * trace.scene.eval_emitter_direction(lighting.si, lighting.light, lighting.lit)
 
@@ -121,7 +121,7 @@ def _at_fixed_point(
 
 
 def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:
-    """Return 1 with the derivative of the log area of the sampled emissive triangle.
+    """Return a factor of value 1, whose derivative is the derivative of the log area of the sampled triangle.
 
     The factor is needed because Mitsuba samples a mesh with the triangle areas at load time, without derivatives.
     """

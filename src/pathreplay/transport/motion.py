@@ -16,7 +16,7 @@ from pathreplay.transport.start import Start
 from pathreplay.transport.vertex import Arrival, SampledContinuation, TraceConfig, VertexRecord, VertexSamples
 
 FEW = 8
-"""Largest number of moving shapes that are tracked individually; beyond it, every shape counts as moving."""
+"""Largest number of moving shapes that are tracked individually. If more shapes move, every shape counts as moving."""
 COPIES = frozenset({"Instance", "ShapeGroup"})
 
 
@@ -24,8 +24,8 @@ def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Sha
     """Find the shapes that have gradients themselves or in a child object, such as a BSDF.
 
     Returns None, which means that everything may move, if gradients exist outside the shapes, in an instance or shape
-    group, or in more than `FEW` shapes. The caller knows that the objects in ``still`` do not move. The gradients of
-    these objects are ignored.
+    group, or in more than `FEW` shapes. Gradients of the objects in ``still`` are ignored, because the caller knows
+    that these objects do not move.
     """
     params = mi.traverse(scene)
     with dr.resume_grad():
@@ -94,9 +94,8 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
 def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
     """Return whether the weight of a continuation on a surface depends on parameters with gradients.
 
-    The result is valid only if the paths do not move. ``at`` is the first arrival. As later passes do, the function
-    traces the weight of a lobe that is unknown at trace time. It then inspects whether this weight has gradients.
-    Nothing is evaluated.
+    The result is valid only if the paths do not move. ``at`` is the first arrival. The function records the weight of a
+    lobe symbolically, like later passes, and checks whether the weight has gradients. Nothing is evaluated.
     """
     lobe, valid = at.hit.prim_index, at.hit.is_valid()  # values unknown at trace time
     si = at.hit.compute_surface_interaction(at.ray, compat.shading(), valid)

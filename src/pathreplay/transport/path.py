@@ -27,7 +27,7 @@ class PathState:
     # β, but with the first zero weight of each channel replaced (see `sustain`). Termination depends on β_alive and not
     # on β, so that paths with derivatives continue. None if zero weights end paths.
     β_alive: mi.Spectrum | None
-    η: mi.Float  # relative index of refraction since the camera
+    η: mi.Float  # product of the relative indices of refraction since the camera
     depth: mi.UInt32  # number of vertices before this one
     active: mi.Bool
 
@@ -61,7 +61,7 @@ class PathState:
     ) -> tuple[PathState, VertexRecord]:
         """Move to the next vertex; return the new state and the record of the previous vertex for later passes.
 
-        ``at`` is the next arrival if the caller has traced it already.
+        ``at`` is the next arrival, if the caller has already traced it.
         """
         β = self.β * dr.detach(step.w)
         β_alive = None if self.β_alive is None else sustain(self.β_alive, self.β, step)

@@ -28,13 +28,13 @@ from pathreplay.transport.vertex import (
 )
 
 # Largest relative difference of the weights, and largest squared distance of the directions, between a lobe sampled
-# alone and the original sample. Rounding errors in float32 are far smaller. BSDFs that do not support restricted
-# sampling (`mask`) have far larger differences.
+# alone and the original sample (see `_delta_weight`). Rounding errors in float32 are far smaller. BSDFs that do not
+# support restricted sampling (`mask`) have far larger differences.
 SAME_LOBE = 1e-3
 
-# A lobe counts as narrow if its density at the centre is larger than that of a diffuse lobe. The noise of a detached
-# lobe is proportional to the slope of the log density. The noise of an attached lobe is proportional to the slope of
-# the radiance. docs/gradients.md lists the variances for different roughnesses.
+# A lobe counts as narrow if its density at the centre is larger than the density of a diffuse lobe, 1/π. With detached
+# sampling, the noise of the gradient is proportional to the slope of the log density. With attached sampling, it is
+# proportional to the slope of the incident radiance. docs/gradients.md lists the variances for different roughnesses.
 NARROW = 1 / dr.pi
 
 
@@ -46,7 +46,7 @@ class Sampled:
     pdf_light: mi.Float  # density of sampling the direction of the emitter sample
     w: mi.Spectrum  # weight of the continuation
     kept: SampledContinuation
-    null: mi.Bool  # the continuation passes through without scattering
+    null: mi.Bool  # the continuation passes the surface unscattered
     eta: mi.Float
     active: mi.Bool  # there is a continuation
 
@@ -168,8 +168,9 @@ def _at_surface(
     if ctx.mode == mi.TransportMode.Importance:
         f = smooth_adjoint(v, wo, smooth)
     w = f * J * dr.detach(reciprocal(kept.pdf))
-    # A failed sample has weight zero even if f is not zero (`roughdielectric` may reflect to the far side). The weight
-    # of a black BSDF is also zero, but here f is zero, and the derivative of the weight is kept.
+    # A failed sample has weight zero even if f is not zero (`roughdielectric` may sample a reflected direction on the
+    # wrong side of the surface). The weight of a black BSDF is also zero, but here f is zero, and the derivative of the
+    # weight is kept.
     w = dr.select(kept.black & dr.any(dr.detach(f) != 0), 0, w)
 
     if attached and trace.resamples:
@@ -185,8 +186,8 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
 
     If the direction followed a moving hit point, the value of the lobe would change with the direction. In a narrow
     lobe, this derivative is large and noisy. Edges move across a fixed direction, which is therefore used only if
-    boundary terms are estimated. The choice depends on vertex and incident ray only, so that all directions sampled at
-    a vertex move in the same way.
+    boundary terms are estimated. The criterion depends on vertex and incident ray only, so that all directions sampled
+    at a vertex move by the same rule.
     """
     if not (trace.may_slide and trace.traits.glossy):
         return mi.Bool(False)
@@ -207,7 +208,7 @@ def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi
 
 
 def _followed(trace: TraceConfig, v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
-    """Return the lanes whose smooth lobe is sampled attached. The direction within the lobe does not matter."""
+    """Return the lanes whose smooth lobe is sampled attached. The sampled direction does not affect the result."""
     if not trace.follows:
         return mi.Bool(False)
     index = dr.reinterpret_array(mi.UInt32, v.bsdf)
@@ -241,8 +242,8 @@ def _delta_weight(
     for k in range(trace.traits.lobes):
         alone = mi.BSDFContext(ctx.mode)
         alone.component = k
-        # On the back of a two-sided BSDF, ``sampled_component`` starts at zero again, but ``component`` counts from the
-        # front.
+        # On the back of a two-sided BSDF, ``sampled_component`` is numbered from zero, but ``component`` continues the
+        # numbering of the front. All components are then tried.
         picked = missing if trace.traits.two_sides else missing & (kept.lobe == k)
         sample, w_k = v.bsdf.sample(alone, v.si, u.lobe, u.direction, picked)
         w_k *= dr.detach(reciprocal(kept.pdf))

@@ -1,9 +1,8 @@
 """Connections of light paths to a sensor: direction, film position and importance, as seen from a vertex.
 
-A camera ray and a connection describe the same segment. The importance W of a connection is defined so that the image
-of a scene is the integral of f W over light paths and points of the aperture, with f the radiance throughput of the
-path. Seen from the vertex, W converts an area element on the surface, perpendicular to the segment, into an area
-element on the film, in which the film has area 1.
+The importance W of a connection is defined so that the image of a scene is the integral of f W over light paths and
+points of the aperture, with f the radiance throughput of the path. W is the area element on the film, whose total area
+is 1, divided by the corresponding area element at the vertex, perpendicular to the connection.
 """
 
 from __future__ import annotations
@@ -48,14 +47,14 @@ class SensorLink:
     sensor: mi.Sensor
     reach: float
     adjoint: Callable[[mi.Point2f, mi.Spectrum, mi.Bool], mi.Spectrum] | None = None
-    """Maps (film position, wavelengths, active) to the adjoint of the radiance there. None if images are computed."""
+    """Maps (film position, wavelengths, active) to the adjoint of the radiance there. None if there is no adjoint."""
     caustics: bool = False
-    """Whether only caustics are connected: paths whose first vertex is a delta lobe. The sensor then has to be
-    connected to a later vertex."""
+    """Whether only caustics are estimated: paths whose first vertex scatters with a delta lobe. The sensor is then
+    connected to later vertices only."""
 
     @staticmethod
     def of(sensor: mi.Sensor) -> SensorLink:
-        """Describe a sensor. Raises PathreplayError if light paths cannot be connected to sensors of its class."""
+        """Create the link to a sensor. Raises PathreplayError if its class or film is not supported."""
         if sensor.class_name() not in (*PROJECTIVE, METER):
             raise PathreplayError(
                 f"light paths cannot be connected to sensor '{sensor.id()}' of class {sensor.class_name()}: take "
@@ -113,8 +112,8 @@ class SensorLink:
                 lens = mi.Point3f(disk.x, disk.y, 0)
             d = mi.Vector3f(p - lens)
             through = lens + d * (params["focus_distance"] / z) if kind == "ThinLensCamera" else p
-            # The area element on the plane at depth 1 is dω / cos³, and dω = dA / |d|². Scaled axes of the camera are
-            # not supported by Mitsuba's camera rays either.
+            # The area element on the plane at depth 1 is dω / cos³, and dω = dA / |d|². The camera's transform must not
+            # scale its axes, which Mitsuba's camera rays do not support either.
             W = scale * dr.sqrt(dr.squared_norm(d)) / (z * z * z) / dr.square(project.matrix[3, 2])
             towards = to_world @ -d
         screen = project @ mi.Point3f(through)

@@ -69,7 +69,7 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
     """
     with dr.suspend_grad():
         si = hit.compute_surface_interaction(ray, compat.shading(), active)
-        kind = si.shape.shape_type()  # not hit.shape, which may be an instance and then has no type
+        kind = si.shape.shape_type()  # hit.shape may be an instance, which has no type
         on_mesh = active & si.shape.is_mesh()
         square, disk = kind == int(mi.ShapeType.Rectangle), kind == int(mi.ShapeType.Disk)
         limb = dr.abs(dr.dot(si.n, ray.d)) < GRAZING

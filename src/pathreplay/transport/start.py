@@ -1,4 +1,4 @@
-"""Start: the first ray of a path, and its first arrival."""
+"""Start: generate the first ray of a path, and intersect it with the scene."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Start(Protocol):
     active: mi.Bool
 
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
-        """Find the first arrival along the rays, detached."""
+        """Intersect the rays with the scene. Nothing is differentiated."""
 
     def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:
         """Return origin and direction of the rays, differentiably."""
@@ -37,7 +37,7 @@ class CameraStart:
     active: mi.Bool
 
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
-        """Find the first arrival along the rays, detached; ``hide_emitters`` makes area emitters transparent."""
+        """Intersect the rays with the scene, through area emitters if these are hidden. Nothing is differentiated."""
         ray = mi.Ray3f(dr.detach(self.ray))
         hit = meet(trace, ray, active, coherent=True)
         if trace.skips_null:
@@ -60,7 +60,7 @@ class CameraStart:
 def behind_emitters(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """Return the first hit that is not on an area emitter; distances are measured along ``ray``."""
+    """Return the first hit that is not on an area emitter. Its distance is measured from the origin of ``ray``."""
     passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
     si = hit.compute_surface_interaction(ray, compat.minimal(), passed)
     onward = si.spawn_ray(ray.d)

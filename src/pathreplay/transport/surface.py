@@ -68,8 +68,8 @@ def normal_in_frame(
     """Return the geometric normal in the shading frame of ``si``, differentiable in the shape only.
 
     The position on the shape is constant. On a mesh with interpolated normals, the normal in the shading frame drifts
-    as the position moves within a triangle, and jumps back at the edge to the next one. The mean derivative of both is
-    nearly zero, but only the drift could be differentiated.
+    as the position moves within a triangle, and jumps back at the edge to the next triangle. Drift and jumps nearly
+    cancel in the mean, but automatic differentiation would include the drift only.
     """
     n = dr.detach(si.to_local(si.n))
     y = hit.compute_surface_interaction(ray, compat.shading() | compat.follow_shape(), active)
@@ -84,7 +84,7 @@ class SurfacePoint:
     """A point with fixed surface coordinates, which moves with its surface."""
 
     p: mi.Point3f
-    A: mi.Vector3f  # area element times the normal; only relative changes of its length are meaningful
+    A: mi.Vector3f  # normal times area element, up to a constant factor
     n: mi.Normal3f  # normal that determines the sign of κ; detached
     κ: mi.Float  # curvature of a sphere (> 0: convex), 0 for a plane, infinite for other surfaces; detached
 

@@ -1,8 +1,9 @@
 """Velocity field of smooth continuations under motion: follow the next hit point or keep the direction.
 
 Let x be a vertex, y the hit point of its continuation along d, and r = |y - x|. An integral over directions does not
-depend on its parametrisation. The direction d may therefore move with any velocity field V(d), if the weight contains a
-factor J with (log J)' = div V. Two simple fields are
+depend on its parametrisation. When the parameters change, the direction d may therefore move with any velocity field
+V(d), if the weight contains a factor J with (log J)' = div V. The prime denotes the derivative with respect to a
+parameter. Two simple fields are
 
     V_H    d points to y, which moves with its surface: J_H = |A·d| / r², with A the area element at y
     0      d is constant
@@ -10,14 +11,16 @@ factor J with (log J)' = div V. Two simple fields are
 With V_H, the edges of emitters and the seams between materials have fixed positions in the integrand. With other
 fields, their motion is a boundary term, which the interior term does not contain. However, let h be the distance from x
 to the plane of y. If x moves parallel to this plane, (log J_H)' grows like 1/h, and the variance is infinite wherever
-two surfaces touch. The field used here is therefore the blend V = φ V_H, with φ = 1 - exp(-m) and m = h r / h0²:
+two surfaces touch. The field used here is therefore the blend V = φ V_H, with φ = 1 - exp(-m), m = h r / h0² and the
+length h0 of `blend_length`:
 
     (log J)' = φ (log J_H)' + ∇φ·V_H,        ∇φ·V_H = -m exp(-m) (n·d_H') / (n·d)
 
-In the second equation, only r depends on d: all directions that hit the plane have the same h. The factor r in m keeps
-V close to V_H at distant hit points on a near plane. Such points may lie on edges. The cost in variance is small,
-because few directions, at grazing angles, reach them. For a sphere, h is the distance from x to the sphere. This
-distance does not depend on d either, and does not vanish at the silhouette. On other curved shapes, V = V_H.
+Here n is the normal of the plane, and d_H the direction to y. In ∇φ, only r depends on d, because all directions that
+hit the plane have the same h. The factor r in m keeps V close to V_H at distant hit points on a near plane. Such points
+may lie on edges. The cost in variance is small, because few directions, at grazing angles, reach them. For a sphere, h
+is the distance from x to the sphere. This distance does not depend on d either, and does not vanish at the silhouette.
+On other curved shapes, V = V_H.
 """
 
 from __future__ import annotations
@@ -29,8 +32,9 @@ import mitsuba as mi
 
 from pathreplay.transport.surface import SurfacePoint, surface_point
 
-# h0 relative to the size of the shape that was hit. A larger value gives less noise, but more of the derivative due to
-# nearby moving edges is missing. docs/gradients.md has measurements for 0.003 to 0.03.
+# h0 relative to the size of the shape that was hit. A larger value gives less noise. Without boundary terms, a larger
+# value also omits more of the derivative due to moving edges nearby. docs/gradients.md has measurements for 0.003 to
+# 0.03.
 BLEND = 0.01
 # Value of m above which V equals V_H to within 0.1 %.
 CLOSE = 7.0
@@ -70,9 +74,9 @@ def moved_direction(
 def jumps_at_facets(
     lengths: mi.Float, origin: mi.Interaction3f, hit: mi.PreliminaryIntersection3f, p: mi.Point3f, n: mi.Normal3f
 ) -> mi.Bool:
-    """Return whether V is discontinuous between facets at ``hit``, at position ``p`` with normal ``n``.
+    """Return whether V is discontinuous between the facets at ``hit``.
 
-    Near the surface φ depends on the plane of the triangle that was hit.
+    ``p`` and ``n`` are position and normal at the hit. Near the surface, φ depends on the plane of the triangle.
     """
     towards = p - origin.p
     h0 = dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())

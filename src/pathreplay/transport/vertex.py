@@ -19,14 +19,14 @@ Real = TypeVar("Real", "mi.Float", "mi.Spectrum")
 
 @dataclass(frozen=True, kw_only=True)
 class TraceConfig:
-    """The scene and the options of a trace: Python values, constant in a recorded kernel."""
+    """The scene, and the options for tracing paths. All fields except arrays are constants of a recorded kernel."""
 
     # The scene.
     scene: mi.Scene
     traits: Traits
     media: Media = None  # type: ignore[assignment]
-    """None in a scene without media. Paths follow the conventions of Mitsuba's `path` without media, and those of
-    `volpath` with media: null boundaries then do not count as vertices."""
+    """None in a scene without media. Without media, paths follow the conventions of Mitsuba's `path`. With media, they
+    follow the conventions of `volpath`: null boundaries (surfaces with a `null` BSDF) do not count as vertices."""
 
     # Properties of the integrator.
     attach: str
@@ -43,28 +43,28 @@ class TraceConfig:
 
     # Inputs of gradient estimators.
     baseline: Callable[..., mi.Spectrum] | None = None
-    """Maps (MediumInteraction3f, extinction, majorant, Bool) to a Spectrum, an estimate of the radiance that arrives at
-    a point of a medium along the ray. None means zero. The quality of the estimate affects noise, but not the mean."""
+    """Maps (MediumInteraction3f, extinction, majorant, active) to an estimate of the radiance (Spectrum) that arrives
+    along the ray. A poor estimate increases noise, but causes no bias: see `fly_again`. None means zero."""
     branching: mi.Float | None = None
-    """Relative weight c of null collisions (see `branch_weight`), or None without null branching. Null branching keeps
-    one null collision per path, for derivatives where real collisions cannot occur."""
+    """Relative weight c of null collisions (see `branch_weight`), or None without null branching. Null branching starts
+    an extra path at one null collision of each path, to estimate derivatives where real collisions cannot occur."""
     may_slide: bool = False
-    """Whether boundary terms are estimated. Some smooth continuations then have a fixed direction, although edges may
-    move across this direction (see `keeps_direction` and `is_seen_through` in `scatter`)."""
+    """Whether boundary terms are estimated. Some directions sampled from smooth lobes are then fixed, although edges
+    may move across them (see `keeps_direction` and `is_seen_through` in `scatter`)."""
 
     # Light paths.
     to_sensor: SensorLink | None = None
-    """The sensor to which vertices are connected, on paths that start at emitters. None: paths start at the sensor, and
+    """The sensor to which vertices are connected, if paths start at emitters. None if paths start at the sensor and
     vertices are connected to emitters."""
     without_caustics: bool = False
-    """Whether paths from the sensor omit caustics, which light paths add: paths whose first vertex scatters with a
-    smooth lobe, and whose last vertex before the emitter with a delta lobe."""
+    """Whether camera paths omit caustics, because light paths estimate them. Caustics are paths with a smooth lobe at
+    the first vertex and a delta lobe at the last vertex before the emitter, which is not an environment."""
 
     # Choices of the caller.
     skips_null: bool = False
-    """Whether rays skip null boundaries, as in the search for edges. If True, ``media`` must be None."""
+    """Whether rays pass through null boundaries, as in the search for edges. If True, ``media`` must be None."""
     steady_frames: bool = False
-    """Whether `steady` replaces the shading frames of meshes."""
+    """Whether the function `steady` replaces the shading frames of meshes."""
     background_apart: bool = False
     """Whether the caller adds the `background` after all paths have ended. Rays that leave the scene then have no
     vertex at their end."""
@@ -76,7 +76,7 @@ class TraceConfig:
 
     @property
     def follows(self) -> bool:
-        """Whether smooth lobes may be sampled attached; with ``delta``, only narrow ones in scenes without outlines."""
+        """Whether smooth lobes may be sampled attached; if ``delta``, only narrow lobes in scenes without outlines."""
         narrow = self.attach == "delta" and not self.traits.outlines
         return bool(self.traits.attachables) and (narrow or self.attach == "all")
 
@@ -87,7 +87,7 @@ class TraceConfig:
 
     @property
     def background_is_opaque(self) -> bool:
-        """Whether a camera ray that hits nothing counts as covered in the alpha channel."""
+        """Whether a camera ray that hits nothing has alpha 1."""
         return not self.hide_emitters and self.scene.environment() is not None
 
 
@@ -116,7 +116,7 @@ class Arrival:
     delta: mi.Bool  # the direction comes from a delta lobe or from the camera
     camera: mi.Bool  # the previous vertex is the camera
     # None in scenes without media:
-    medium: mi.MediumPtr = None  # type: ignore[assignment]  # the medium around the ray
+    medium: mi.MediumPtr = None  # type: ignore[assignment]  # the medium that contains the ray
     behind: mi.Float = None  # type: ignore[assignment]  # distance from the ray's origin back to the previous vertex, through null boundaries
     # None unless caustics are omitted:
     scattered: mi.Bool = None  # type: ignore[assignment]  # the first vertex of the path has scattered with a smooth lobe
@@ -133,15 +133,15 @@ class SampledContinuation:
     lobe: mi.UInt32  # the BSDF component that was sampled
     lit: mi.Bool  # the emitter sample is valid and unoccluded
     media: SampledInMedia = None  # type: ignore[assignment]  # None in scenes without media
-    known: KnownLight | None = None  # on surfaces, if no emitter parameter has gradients; else None
-    light: mi.DirectionSample3f | None = None  # the emitter sample, if it is still available
+    known: KnownLight | None = None  # recorded emission, if later passes do not differentiate emitters; else None
+    light: mi.DirectionSample3f | None = None  # the emitter sample; None on light paths and in records
 
 
 @dataclass
 class SampledInMedia:
     """Additional choices in a scene with media."""
 
-    null: mi.Bool  # the continuation passes through without scattering
+    null: mi.Bool  # the continuation passes the surface unscattered
     flight: Flight  # the flight to the vertex
     shadow: Shadow  # the shadow ray from the vertex to its emitter sample
 
@@ -152,7 +152,7 @@ class Flight:
 
     event: mi.Bool  # a real collision happened before any surface
     t: mi.Float  # distance to the real collision
-    density: mi.Float  # probability density p σ̄ of the real collision; 1 if there is no collision
+    density: mi.Float  # p σ̄, with p the probability of a real collision and σ̄ the majorant; 1 without a collision
     W: mi.Spectrum  # product of the weights of all null collisions on the flight; 1 in grey media
     along: mi.Float  # random offset in [0, 1) of the points at which the transmittance is differentiated
     p: mi.Float = None  # type: ignore[assignment]  # probability that the collision was real (None if no null collisions are kept)
@@ -162,7 +162,7 @@ class Flight:
     c_emit: mi.Spectrum = None  # type: ignore[assignment]  # weight of the emission at distance t_emit
     # Used by the sampling pass only; None when read from a record:
     σ_s: mi.Spectrum = None  # type: ignore[assignment]  # scattering coefficient at the collision
-    null: NullCollision = None  # type: ignore[assignment]  # the null collision that is kept; None if none is kept
+    null: NullCollision = None  # type: ignore[assignment]  # the null collision at which the path may branch; None without null branching
 
     @staticmethod
     def none(media: Media) -> Flight:
@@ -187,11 +187,11 @@ class NullCollision:
     """
 
     t: mi.Float  # distance of the collision along the ray
-    ω: mi.Spectrum  # W c branch_weight(p, c) / (σ̄ m), with W the weight of all earlier null collisions
+    ω: mi.Spectrum  # W c branch_weight(p, c) / (σ̄ m), with W the product of the weights of earlier null collisions
     bare: mi.Float  # ω without the factor W
     mass: mi.Float  # sum of m over all null collisions of the flight
     number: mi.Float  # number of null collisions of the flight
-    pick: mi.Float  # random number for the choice between this flight and earlier flights of the path
+    pick: mi.Float  # random number that selects between this flight and earlier flights of the path
 
 
 @dataclass
@@ -210,7 +210,7 @@ class KnownLight:
 
     glow: mi.Spectrum  # radiance emitted at the vertex, MIS weighted
     d: mi.Vector3f  # direction of the emitter sample
-    w: mi.Spectrum  # radiance of the emitter sample over density, MIS weighted
+    w: mi.Spectrum  # radiance of the emitter sample divided by its density, MIS weighted
 
 
 @dataclass
@@ -248,7 +248,7 @@ class Signature:
 
 @dataclass
 class Splat:
-    """The contribution of a vertex of a light path to the film, before the throughput."""
+    """The contribution of a vertex of a light path to the film, without the throughput up to this vertex."""
 
     c: mi.Spectrum  # f W, with W the importance of the sensor
     s: mi.Point2f  # film position in pixels
@@ -261,9 +261,9 @@ class Step:
     e: mi.Spectrum  # emission (MIS weighted) + next-event estimate; on light paths, contribution times image adjoint
     w: mi.Spectrum  # f/p or lobe weight, before Russian roulette
     ray_next: mi.Ray3f
-    pdf: mi.Float  # density of the continuation, for the next vertex
+    pdf: mi.Float  # density of the continuation, for the MIS weight at the next vertex
     signature: Signature
-    splat: Splat | None = field(default=None, kw_only=True)  # on light paths
+    splat: Splat | None = field(default=None, kw_only=True)  # contribution to the film; None on camera paths
 
 
 @dataclass
@@ -272,14 +272,14 @@ class SampledStep(Step):
 
     kept: SampledContinuation
     eta: mi.Float  # relative index of refraction across the continuation
-    null: mi.Bool  # the continuation passes through without scattering
+    null: mi.Bool  # the continuation passes the surface unscattered
     active: mi.Bool  # there is a continuation
     medium: mi.MediumPtr = None  # type: ignore[assignment]  # medium along the continuation; None in scenes without media
     lighting: Lighting = None  # type: ignore[assignment]  # on surfaces, if emitters have gradients; else None
 
     @property
     def seen(self) -> mi.Bool:
-        """Mitsuba's alpha: whether the ray hit a surface or had a collision, and does not continue unscattered."""
+        """Mitsuba's alpha: whether the ray was scattered or absorbed, at a surface or at a collision."""
         return self.signature.met & ~self.null
 
 
@@ -296,5 +296,5 @@ def reciprocal(x: Real) -> Real:
 
 
 def is_smooth(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """Return the lanes whose BSDF has a lobe that next-event estimation can reach."""
+    """Return the lanes whose BSDF has a smooth lobe, so that next-event estimation is possible."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)

@@ -2,9 +2,9 @@
 
 A second pass with the same random numbers differentiates each tentative collision: null collisions as dσ_n/σ_n and real
 collisions as dσ_s/σ_s (supplement of Vicini, Speierer, Jakob 2021, listings 1 and 2). Where σ_n is zero, no null
-collision is sampled, and where σ_s is zero, no real collision. The derivatives of these collisions are then missing. On
-a constant grid, σ_n is zero everywhere, and the whole derivative of the transmittance is missing. `pathreplay` does not
-have this limitation. This driver exists for comparison.
+collision is sampled. Where σ_s is zero, no real collision is sampled. The derivatives of these collisions are then
+missing. On a constant grid, σ_n is zero everywhere, and the whole derivative of the transmittance is missing.
+`pathreplay` does not have this limitation. This driver exists for comparison.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
     """
     if dr.hint(trace.media is None, mode="scalar"):
         raise PathreplayError("prb_volume_listing differentiates media, and the scene has none: use 'pathreplay'")
-    # Uses Mitsuba's interface for all media, so that every tracked collision can be differentiated.
+    # Use Mitsuba's interface for all media, so that every tracked collision can be differentiated.
     trace = replace(trace, media=replace(trace.media, grids=(), plain=True))
     sampler, path = start.sampler, PathState.begin(trace, start)
     if dr.hint(path_moves(trace, start, path.at), mode="scalar"):
@@ -51,7 +51,8 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
         u, step = path.choose(trace, sampler)
         kept = step.kept
 
-        # All radiance along the ray passed the flight's null collisions and, if there is one, its real collision.
+        # All radiance along the ray has the weights of the flight's null collisions and of its real collision, if any,
+        # as factors.
         differentiate_flight(path.at, kept.media.flight, past, path.active, δL * L)
         L -= path.β * step.e
 

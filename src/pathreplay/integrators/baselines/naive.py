@@ -1,7 +1,7 @@
 """The naive driver: automatic differentiation of a wavefront of paths, for comparison.
 
-Every vertex of every path is evaluated in memory, and stays there until the graph of the whole loop has been
-back-propagated. Memory therefore grows with the number of paths times their length, as in plain reverse-mode AD.
+Every vertex of every path is evaluated to memory, and stays there until the AD graph of the whole loop has been
+traversed. Memory therefore grows with the number of paths times their length, as in plain reverse-mode AD.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter)
 
 
 def _cut(state: T) -> T:
-    """Return the same values, and make AD passes evaluate their derivatives at this point.
+    """Return the same values. During AD traversal, the derivatives of these values are evaluated to memory.
 
-    Otherwise the reverse pass is a single kernel whose size grows with depth. At 64 vertices, compilation takes a
-    minute.
+    Without this function, the reverse pass would be a single kernel, whose size grows with depth. At 64 vertices,
+    compilation takes a minute.
     """
 
     class Cut(dr.CustomOp):
@@ -82,7 +82,7 @@ def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, 
         valid = mi.Bool(trace.background_is_opaque) & path.active
     moves = path_moves(trace, start, at)
     L = mi.Spectrum(0)  # accumulated radiance
-    β = mi.Spectrum(1)  # attached throughput; origin, direction and density of the arrival below are attached as well
+    β = mi.Spectrum(1)  # attached throughput; ``o``, ``d`` and ``pdf`` below are attached as well
     first = start.ray if moves else at.ray
     o, d, pdf = mi.Point3f(first.o), mi.Vector3f(first.d), mi.Float(at.pdf)
 

@@ -1,4 +1,4 @@
-"""Radiative backpropagation: adjoint radiance is traced from the camera, for comparison.
+"""Radiative backpropagation, for comparison: adjoint radiance is propagated from the camera into the scene.
 
 At every vertex, δL β_i multiplies the derivative of e_i + w_i L_{i+1}. An independent path of the full remaining depth
 estimates L_{i+1}, the incident radiance along the continuation (Nimier-David, Speierer, Ruiz, Jakob: Radiative

@@ -46,7 +46,7 @@ RayDerivatives: TypeAlias = "tuple[list[mi.Vector3f], list[mi.Vector3f]]"
 
 @dataclass(frozen=True)
 class Sample:
-    """The sample of a camera ray: see Mitsuba's Sensor. Positions are in units of the film's width and height."""
+    """The arguments of Mitsuba's `Sensor.sample_ray`. Positions are in units of the film's width and height."""
 
     time: mi.Float | float
     wavelength: mi.Float
@@ -67,7 +67,7 @@ class FilmFlow(Protocol):
 
     @property
     def is_all(self) -> bool:
-        """Whether the term of the flow, `FilmMotion`, is the whole derivative of the image."""
+        """Whether the term `FilmMotion` of this flow is the whole derivative of the image."""
 
     @property
     def samples(self) -> int:
@@ -81,10 +81,10 @@ class FilmFlow(Protocol):
         """
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
-        """Return zero, attached to the parameters such that its derivative is the film velocity v."""
+        """Return an AD variable of value zero, whose derivative with respect to the parameters is the velocity v."""
 
     def divergence(self, sample: Sample) -> mi.Float:
-        """Return zero, attached to the parameters such that its derivative is the divergence ∂v_x/∂x + ∂v_y/∂y."""
+        """Return an AD variable of value zero, whose derivative is the divergence ∂v_x/∂x + ∂v_y/∂y."""
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
         """Return whether the velocity at a film position may be non-zero."""
@@ -101,7 +101,7 @@ class CameraFlow:
     """The flow of a moving sensor: see `FilmFlow`."""
 
     sensor: mi.Sensor
-    r: mi.Float  # distance of the points through which the rays keep passing
+    r: mi.Float  # distance of the points through which the rays continue to pass
     leaves_rest: bool  # whether rays have motion that the flow does not contain
     is_all: bool
     samples: int = 2
@@ -151,7 +151,7 @@ class CameraFlow:
         """Do nothing, since all terms differentiate the sensor itself."""
 
     def _velocity(self, ray: mi.Ray3f, derivatives: RayDerivatives) -> mi.Vector2f:
-        """Return the velocity (of value zero) from an attached ray and its derivatives along the film's axes."""
+        """Compute the `velocity` from an attached ray and its derivatives along the film's axes."""
         δp = (ray.o - dr.detach(ray.o)) + self.r * (ray.d - dr.detach(ray.d))
         return -film_velocity(δp, derivatives, self.r)
 

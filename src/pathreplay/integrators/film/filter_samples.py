@@ -31,7 +31,7 @@ class FilterSamples:
 
     radius: float
     cdf: mi.Float  # cumulative distribution at the end of each step
-    masses: mi.Float  # integral over each step
+    masses: mi.Float  # integral of the filter, or of its derivative, over each step
     total: mi.Float  # sum of the absolute values of the masses
 
     @staticmethod
@@ -43,7 +43,8 @@ class FilterSamples:
     @staticmethod
     def of_derivative(film: mi.Film) -> FilterSamples:
         """Create the sampler of the filter's derivative. A jump, as at the ends of a box, becomes a point mass."""
-        radius = film.rfilter().radius() * STEPS / (STEPS - 1)  # outer steps then contain jumps at the filter's ends
+        # With this radius, the outermost steps contain the jumps at the ends of the filter.
+        radius = film.rfilter().radius() * STEPS / (STEPS - 1)
         step = 2 * radius / STEPS
         x = _step_centres(radius)
         return FilterSamples._of(radius, film.rfilter().eval(x + 0.5 * step) - film.rfilter().eval(x - 0.5 * step))

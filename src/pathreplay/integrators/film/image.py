@@ -14,8 +14,8 @@ from pathreplay.platform.registration import mitsuba_integrator
 
 # Dr.Jit counts the samples of one kernel in 32 bits.
 MOST_SAMPLES = 2**32 - 1
-# Bytes per pixel. A rendering, its derivative and their files take 127 bytes per pixel, measured as the peak memory of
-# the process for 2048 x 2048 pixels on LLVM. The memory of samples is negligible.
+# Bytes per pixel. An image, its derivative and their files take 127 bytes per pixel. This is the peak memory of the
+# process, measured for 2048 x 2048 pixels on LLVM. The memory of samples is negligible.
 _A_PIXEL = 128
 
 
@@ -70,10 +70,10 @@ def film_size(sensor: mi.Sensor) -> tuple[int, int]:
 
 
 def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int = 0) -> None:
-    """Check that Dr.Jit can process the samples of a sensor's film at once, and that memory suffices for its images.
+    """Check that Dr.Jit can process all samples of a sensor in one kernel, and that memory suffices for its images.
 
-    ``spp`` maps configuration keys to their samples per pixel; ``also`` is the number of bytes needed for other things.
-    Raises PathreplayError otherwise; the message calls the sensor ``name`` and states the largest possible value.
+    ``spp`` maps configuration keys to their samples per pixel; ``also`` is the number of further bytes that are needed.
+    Otherwise, raises PathreplayError. The message calls the sensor ``name`` and states the largest possible value.
     """
     width, height = film_size(sensor)
     pixels = width * height
@@ -82,7 +82,7 @@ def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int
             remedy = f"'{key}' up to {MOST_SAMPLES // pixels}" if pixels <= MOST_SAMPLES else "a smaller film"
             raise PathreplayError(
                 f"'{key}' is {count}: with {name} of {width} x {height} pixels that is {pixels * count} samples, "
-                f"more than the {MOST_SAMPLES} that Dr.Jit takes at once; take {remedy}"
+                f"more than the {MOST_SAMPLES} that Dr.Jit can process at once; take {remedy}"
             )
     thing = f"Rendering {name} of {width} x {height} pixels"
     memory.require(pixels * _A_PIXEL + also, thing, "take a smaller film or fewer sensors")

@@ -1,4 +1,4 @@
-"""The term of moving film positions: derivative of the filter weights under a film flow.
+"""The gradient term of a film flow: the derivative of the filter weights when film positions move.
 
 With the filter h_j of pixel j, restricted to the film D, and the velocity v of film positions (see `camera_flow`),
 
@@ -21,7 +21,8 @@ sampled for the pixel at x_j therefore contributes to all pixels of the row, wit
 
     (W_j - W̄_j) sgn df(x - x_j) + Σ_i W̄_i df(x - x_i) / Σ_i |df(x - x_i)|,
 
-where the denominator is the density of all sampled positions of the row. Forward mode is the transpose.
+where the denominator is the density of the positions that are sampled for all pixels of the row. Forward mode is the
+transpose.
 """
 
 from __future__ import annotations
@@ -50,9 +51,9 @@ from pathreplay.transport.vertex import TraceConfig
 GROUP = 5
 """Number of paths with the same random numbers: right and left, above and below, and one for the divergence."""
 BLUR, MOST = 16, 16
-"""The local mean of the adjoint is taken over a square. From a pixel to each side, the square extends over 1 / BLUR of
-the film's shorter side, but at most MOST pixels. The noise of the term that contains the local mean falls with the
-third power of this length, if the adjoint is smooth over the square."""
+"""The local mean of the adjoint at a pixel is the mean over a square around the pixel. The square extends to each side
+by 1 / BLUR of the film's shorter side, but by at most MOST pixels. The noise of the term that contains the local mean
+falls with the third power of this length, if the adjoint is smooth over the square."""
 
 
 @dataclass
@@ -71,7 +72,7 @@ class FlowPaths:
 
 @dataclass(frozen=True)
 class FilmMotion:
-    """The term of the film flow (see `Term`). Not differentiated: motion of rays that the flow does not contain."""
+    """The gradient term of a film flow. Not differentiated: motion of rays that the flow does not contain."""
 
     flow: FilmFlow
 

@@ -24,12 +24,12 @@ def _largest_spp(max_depth: int) -> int:
 
 
 def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) -> str:
-    """Return why a pixel sweep is impossible for a sensor, as the end of a sentence, with the remedy; "" if possible.
+    """Return why a sensor does not support pixel sweeps, with the remedy; "" if it does.
 
-    A sweep requires an rgb image without alpha, an independent sampler, and a camera without motion and with an
-    instantaneous shutter. The filter must be a box, so that each path belongs to one pixel. If only ``some`` pixels are
-    swept, any non-negative filter can be used (see `FilterSamples`). A pixel must have at least two paths (``spp``),
-    which together fit into the record of a lane.
+    The text is the end of a sentence. A sweep requires an rgb image without alpha, an independent sampler, and a camera
+    without motion and with an instantaneous shutter. The filter must be a box, so that each path belongs to one pixel.
+    If only ``some`` pixels are swept, any non-negative filter can be used (see `FilterSamples`). A pixel must have at
+    least two paths (``spp``), which together fit into the record of a lane.
     """
     film, sampler = sensor.film(), sensor.sampler()
     film.prepare([])

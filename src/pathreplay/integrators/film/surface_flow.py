@@ -1,4 +1,4 @@
-"""Flow of a static camera: film positions follow the visible surfaces, so that surfaces move little under a pixel.
+"""Flow of a static camera: film positions follow the visible surfaces, so that surfaces move little relative to them.
 
 A few probe rays sample the scene. A point p that a probe ray hits moves with its surface. The image of p
 moves on the film with the velocity
@@ -6,8 +6,9 @@ moves on the film with the velocity
     u = (∂(o + t d)/∂s)⁺ ∂p/∂π,
 
 where o + t d is the point at the same distance t on the ray through the film position s. If film positions are fixed,
-the surface slides under them at u / cos, where cos is the cosine between normal and ray. This speed is unbounded at
-silhouettes. Points at grazing angles therefore have the largest weights. The velocity at a node of a grid is the mean
+the hit point of a ray slides over the surface with a speed proportional to u / cos, where cos is the cosine between
+normal and ray. This speed is unbounded at silhouettes. Points at grazing angles therefore have the largest weights. The
+velocity at a node of a grid is the mean
 
     v = Σ K W u / (K_0 + Σ K (W + S)),     W = 1 / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
 
@@ -57,7 +58,7 @@ class SurfaceFlow:
     """The flow of a static sensor: see `FilmFlow`."""
 
     sensor: mi.Sensor
-    nodes: mi.Vector2f  # velocities at grid nodes: their values are zero, and they are attached to moving surfaces
+    nodes: mi.Vector2f  # AD variables of value zero; their derivatives are the velocities at the grid nodes
     flows: mi.Bool  # per cell, at the cell's first node: whether the velocity may be non-zero in or next to the cell
     is_all: bool = False
     samples: int = 5
@@ -138,9 +139,9 @@ class SurfaceFlow:
 def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     """Return whether film positions may follow visible surfaces.
 
-    Film positions that follow one surface move relative to all other surfaces, whose edges must then be sampled. Edges
-    behind mirrors, glass and thin sheets and edges of B-spline curves cannot be sampled. Media are not supported. The
-    caller must exclude textures with seams (see `has_seams`), which cannot be sampled either.
+    Film positions that follow one surface move relative to all other surfaces. The edges of these surfaces must then be
+    sampled, which is impossible behind mirrors, glass and thin sheets, and for B-spline curves. Media are not
+    supported. The caller must exclude textures with seams (see `has_seams`), which cannot be sampled either.
     """
     traits = trace.traits
     hidden = traits.mirrors or traits.veils or traits.splines

@@ -1,4 +1,4 @@
-"""The `pathreplay_particles` integrator plugin: all light by light paths, in place of Mitsuba's `ptracer`."""
+"""The `pathreplay_particles` integrator plugin: traces all light from the emitters, like Mitsuba's `ptracer`."""
 
 from __future__ import annotations
 
@@ -36,21 +36,22 @@ class ParticleIntegrator(PathReplayIntegrator):
     """Differentiable particle tracer for surfaces.
 
     Light paths start at the emitters and are connected to the sensor at every vertex. Their number is the number of
-    pixels times the samples per pixel. Emitters that the sensor sees directly are rendered with camera rays: 2^20 in
-    all or 16 per pixel, unless there are fewer samples.
+    pixels times the samples per pixel. Emitters that the sensor sees directly are rendered with camera rays. Their
+    number is limited to 2^20 in total or 16 per pixel, whichever is more.
 
     Properties, with the default first:
 
     - ``max_depth``: 6; -1 is unbounded, which derivatives do not support.
     - ``rr_depth``: 5.
     - ``hide_emitters``: False; whether emitters that the sensor sees directly are hidden.
-    - ``samples_per_pass``: accepted as in ``ptracer``, without effect: memory does not depend on the number of paths.
+    - ``samples_per_pass``: accepted for compatibility with ``ptracer``. It has no effect, because memory does not
+      depend on the number of paths.
     - ``attach``, ``boundary`` and ``boundary_spp``: as in `PathReplayIntegrator`. The boundary term contains the edges
       of directly visible emitters only.
-    - Other properties of `PathReplayIntegrator`, except ``caustics``, concern the camera rays only.
+    - Other properties of `PathReplayIntegrator`, except ``caustics``, apply to the camera rays only.
 
-    Sensors: ``perspective``, ``thinlens``, ``orthographic`` and ``irradiancemeter``. The image is that of a film with
-    ``sample_border = true`` (see `ParticleFilm`).
+    Sensors: ``perspective``, ``thinlens``, ``orthographic`` and ``irradiancemeter``. The image is the same as with
+    ``sample_border = true`` in the film (see `ParticleFilm`).
 
     Not differentiated: the visibility of vertices from each other and from the sensor; with ``attach='none'``, all
     motion; with a box filter, the motion of film positions.
@@ -73,7 +74,7 @@ class ParticleIntegrator(PathReplayIntegrator):
         return image if lit is None else image + lit
 
     def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
-        """Leave out the terms of the camera rays if the sensor can see no emitter."""
+        """Leave out the terms of the camera rays if no emitter is visible to the sensor."""
         if self.hide_emitters or not any(map(_shines, view.scene.emitters())):
             return view, self._trace_config(view.scene, view.sensor, state), ()
         return PathReplayIntegrator._planned(self, view, state, follow)

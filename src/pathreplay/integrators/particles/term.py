@@ -25,12 +25,12 @@ from pathreplay.transport.vertex import TraceConfig
 class ParticleTerm:
     """Image and derivative of light paths. Their number is the number of samples of the pass.
 
-    Every path is differentiated as in `PathReplay`, and additionally in its film positions. Not differentiated: the
-    visibility of vertices from each other and from the sensor, and with a box filter the motion of film positions.
+    Every path is differentiated as in `PathReplay`, and also with respect to its film positions. Not differentiated:
+    the visibility of vertices from each other and from the sensor, and with a box filter the motion of film positions.
     """
 
-    max_depth: int  # of the path from emitter to sensor, as in Mitsuba
-    caustics: bool  # only the paths that `TraceConfig.without_caustics` omits
+    max_depth: int  # depth of the whole path from emitter to sensor, counted as in Mitsuba
+    caustics: bool  # whether only the paths that `TraceConfig.without_caustics` omits are traced
 
     @staticmethod
     def require_no_media(trace: TraceConfig) -> None:

@@ -1,6 +1,6 @@
 """Smoothing groups of meshes: sets of triangles that are shaded as one surface. Edges lie where two groups meet.
 
-Triangles share the shading normal of a common vertex. At a visible edge, and at a seam of texture coordinates,
+Triangles with a common vertex share its shading normal. At a visible edge, and at a seam of texture coordinates,
 modelling programs duplicate vertices. The triangles on both sides then have two positions in common, but no vertex.
 """
 

@@ -31,7 +31,7 @@ INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Entries of `Tables.groups_at`: WHOLE for shapes whose only edges are outlines, FACETS for flat-shaded meshes."""
 COARSE = 1.0
-"""Mean angle in degrees between triangles and shading normals above which a mesh is coarse."""
+"""Mean angle in degrees between geometric and shading normals above which a mesh is coarse."""
 
 MOST_RUNS = 4096
 """Largest number of runs of equal values in an array that `_array` creates while `dr.freeze` records."""
@@ -49,9 +49,9 @@ class Tables:
     are created while `dr.freeze` records (see `_array`).
     """
 
-    attachable: mi.Bool | None  # by BSDF: its smooth lobes may be sampled attached (None: for no BSDF)
-    blend_lengths: mi.Float  # by shape: `velocity.blend_length`
-    groups_at: mi.UInt32  # by shape: offset of its triangles in `groups`, or `WHOLE` or `FACETS`
+    attachable: mi.Bool | None  # whether the smooth lobes of each BSDF may be sampled attached; None: of no BSDF
+    blend_lengths: mi.Float  # `velocity.blend_length` of each shape
+    groups_at: mi.UInt32  # for each shape, the offset of its triangles in `groups`, or `WHOLE` or `FACETS`
     groups: mi.UInt32  # concatenated `smoothing_groups` of the meshes with an offset; entry 0 is unused
     emitter_bounds: mi.Float  # bounding spheres of mesh emitters: see `emitter_bounds`
 
@@ -66,7 +66,7 @@ class Traits:
     detached_names: tuple[str, ...]  # class names of BSDFs with smooth lobes that are never sampled attached
     area_lights: bool  # some emitter has an outline
     hard_lights: bool  # some emitter casts hard shadows
-    projectors: tuple[mi.Emitter, ...]  # projectors: the region that they light has a hard boundary
+    projectors: tuple[mi.Emitter, ...]  # projectors: the illuminated region has a hard boundary
     spots: tuple[mi.Emitter, ...]  # spot lights: their cone has a hard boundary if beam_width >= cutoff_angle
     mesh_lights: bool  # some mesh emits
     sphere_lights: bool  # some sphere emits
@@ -76,7 +76,7 @@ class Traits:
     two_sides: bool  # some surface may have a different BSDF on its back
     copies: bool  # there are instances
     splines: bool  # there are B-spline curves
-    veils: bool  # some surface may scatter part of the light and pass the rest unscattered
+    veils: bool  # some surface may scatter part of the light and transmit the rest unscattered
     masks_mirrors: bool  # some mask covers delta lobes
     narrow: bool  # some surface may have a narrow smooth lobe
     glossy: bool  # `narrow`, and no checkerboard exists (its seams are not covered by boundary terms)
@@ -237,7 +237,7 @@ def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], othe
 
 
 def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
-    """Return whether (or in which lanes) a BSDF does nothing but pass light unscattered."""
+    """Return whether (or in which lanes) all light passes a BSDF unscattered."""
     others = mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
     return bsdf.flags() & (others | mi.BSDFFlags.Null) == +mi.BSDFFlags.Null
 
@@ -261,9 +261,10 @@ def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
-    """Return whether no edge is visible from a surface point: the scene has one shape, which does not see its edges.
+    """Return whether the scene has a single shape, from whose points no edge is visible.
 
-    A flat shape does not see itself. A sphere sees itself from the inside, but has no edge unless a texture has a seam.
+    A flat shape is not visible from its own points. The inside of a sphere is, but has no edge unless a texture has a
+    seam.
     """
     if len(shapes) != 1 or shapes[0].is_emitter():
         return False

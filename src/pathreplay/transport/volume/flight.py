@@ -2,7 +2,8 @@
 
 Tentative collisions are sampled from a majorant, and each is either real or null. The flight ends at the first real
 collision, or at the surface that bounds the medium. The sampling is not differentiated. Later passes differentiate the
-integrand, which is transmittance times scattering coefficient, at the sampled distance:
+integrand, which is transmittance times scattering coefficient, at the sampled distance. The derivative of the log
+transmittance is
 
     d log T = -∫ dσ_t ds,  estimated as  -(t - a) · mean of dσ_t(y),
 
@@ -125,7 +126,7 @@ def _tentative(
     σ: mi.Float,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
-    """Return the distance from ``t`` to the next tentative collision, and the majorant there: ``σ`` except in grids."""
+    """Return the distance from ``t`` to the next tentative collision, and the majorant there (``σ`` outside grids)."""
     step = dr.select(σ > 0, -dr.log(1 - u) * dr.rcp(σ), dr.inf)
     for grid in trace.media.grids:
         mine = active & is_grid(grid, medium)
@@ -151,7 +152,7 @@ class Flown:
 
     mei: mi.MediumInteraction3f  # the interaction at the collision
     w: mi.Spectrum  # weight of radiance from the flight's end: W, times σ_s/density at a collision; differentiable
-    e: mi.Spectrum  # emission along the flight, plus a control variate: its value is zero, its derivative has mean zero
+    e: mi.Spectrum  # emission along the flight, plus a control variate with value zero, whose derivative has mean zero
 
 
 def fly_again(
@@ -188,7 +189,7 @@ def fly_again(
 
     σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
     σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
-    if trace.branch:  # remove the part of the derivative (at a fixed position) that null collisions estimate
+    if trace.branch:  # subtract the derivative that null collisions estimate, which is taken at a fixed position
         assert trace.branching is not None
         rest = 1 - flight.p * branch_weight(flight.p, trace.branching)
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)

@@ -35,7 +35,7 @@ class Media:
     homogeneous: bool  # some medium other than a grid has constant coefficients
     chromatic: bool  # some extinction differs between channels
     emissive: bool  # some medium emits
-    passes: bool  # some surface that is not a null boundary may pass light unscattered
+    passes: bool  # some surface that is not a null boundary may transmit light unscattered
     branches: bool  # see `wants_branch`
     around: mi.Medium | None  # the medium that contains the sensor
 
@@ -45,8 +45,8 @@ def scene_media(
 ) -> Media | None:
     """Collect the facts about the media of a scene, or return None without media.
 
-    ``passes`` becomes the field of that name, and the medium that contains ``sensor`` the field ``around``.
-    ``branches`` is the result of `wants_branch`, if this result is already known.
+    ``passes`` is stored in the field of the same name. The field ``around`` is the medium that contains ``sensor``.
+    ``branches`` is the result of `wants_branch`, or None if it must be computed.
     """
     if not media:
         return None
@@ -112,7 +112,7 @@ def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumIn
 
 
 def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """Return the part [a, b] of the ray, up to ``reach``, in which the medium may interact; a = b = 0 if it is empty.
+    """Return the part [a, b] of the ray up to ``reach`` in which collisions may occur; a = b = 0 if it is empty.
 
     Differentiable in the ray and in ``reach``.
     """

@@ -25,7 +25,7 @@ STEP = 1e-5
 def skip_null(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """Return the first hit that is not on a null boundary; distances are measured along ``ray``."""
+    """Return the first hit that is not on a null boundary. Its distance is measured from the origin of ``ray``."""
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
     passing = active & _is_boundary(here)
     while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond null boundaries"):
@@ -47,7 +47,10 @@ def _is_boundary(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 def transmittance_up_to(
     trace: TraceConfig, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: Sampler, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
-    """Estimate the transmittance from inside ``medium`` up to ``reach``; also return the medium there. Detached."""
+    """Estimate the transmittance up to distance ``reach``, along a ray that starts in ``medium``. Detached.
+
+    Also returns the medium at distance ``reach``.
+    """
     ray = mi.Ray3f(ray)
     ray.maxt = reach
     stretch = Stretch.begin(ray, medium, active)

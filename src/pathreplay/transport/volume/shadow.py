@@ -21,7 +21,7 @@ from pathreplay.transport.volume.media import carried, interaction, is_grid, maj
 
 @dataclass
 class Stretch:
-    """Loop state of a shadow ray: the segment up to the next surface, inside one medium or none."""
+    """Loop state of a shadow ray: the segment up to the next surface. It contains at most one medium."""
 
     ray: mi.Ray3f  # the ray from the last surface on
     far: mi.Float  # length of the whole shadow ray
