@@ -1,4 +1,4 @@
-"""Evaluates shards in Ray actors, on this machine or on a cluster, with the same bits as in a single process.
+"""Evaluates shards in Ray actors, on this machine or on a cluster, with the same results as in a single process.
 
 Each actor keeps the scene and the compiled kernels. Large values are sent once per step. `Scheduler` decides which
 actor computes which shard. This choice has no effect on the result: an evaluation is a function of the values, the
