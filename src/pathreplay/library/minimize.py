@@ -187,7 +187,7 @@ def _folder_run(
     job: Job, built: inner.Problem, run: Run, stop: Stop, output: Path, resume: bool, stack: ExitStack
 ) -> FolderRun:
     """Create or resume the run folder."""
-    run.optimiser.state()  # raises if the user's optimizer cannot be saved
+    run.optimiser.state()  # raises PathreplayError if the state of the user's optimizer cannot be saved
     resumed = None
     if resume and output.exists():
         _, resumed = open_run_folder(output, job.in_python)

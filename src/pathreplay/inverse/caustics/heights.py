@@ -147,7 +147,7 @@ def _receivers(φ: Field, aspect: float) -> tuple[Field, Field]:
     a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel()
     triangles = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
     corners = points.reshape(-1, 2)[triangles]
-    # All cells in the bounding box of each triangle, one after another.
+    # List the cells in the bounding box of each triangle.
     low = np.clip(np.ceil(corners.min(axis=1)), 0, shape).astype(int)
     high = np.clip(np.floor(corners.max(axis=1)), -1, shape - 1).astype(int)
     sides = np.maximum(high - low + 1, 0)

@@ -35,7 +35,7 @@ class Batch:
         count = n if among is None else len(among)
         numbers = np.random.default_rng([BATCH, seed]).choice(count, min(most, count), replace=False)
         chosen = np.sort(numbers if among is None else among[numbers]).astype(np.uint32)
-        pixels = mi.UInt32(chosen) + dr.opaque(mi.UInt32, 0)  # memory that Dr.Jit owns: see `variables_of`
+        pixels = mi.UInt32(chosen) + dr.opaque(mi.UInt32, 0)  # copy to memory that Dr.Jit owns, see `variables_of`
         dr.eval(pixels)
         return Batch(pixels, count / n)
 

@@ -106,7 +106,7 @@ def _function(
 ) -> Imported:
     """Return the function of a derived parameter: one of the user's, or a displacement."""
     if entry.displace is None:
-        assert entry.function is not None  # see `Derivation`
+        assert entry.function is not None  # `Derivation` requires a function or a displacement
         return modules.function("Derivation", entry.function, "values")
     for argument in arguments:
         require_map(key, argument.key, argument.start.shape)
