@@ -65,7 +65,8 @@ class Jacobians:
             "use fewer parameters or smaller films",
         )
         seeds = [int(s) for s in np.random.SeedSequence([seed]).generate_state(2)]
-        opaque = [dr.opaque(mi.UInt32, half) if self.freezes else half for half in seeds]  # see `Evaluator._differentiated`
+        # Seeds are inputs of recorded passes, as in `Evaluator`.
+        opaque = [dr.opaque(mi.UInt32, half) if self.freezes else half for half in seeds]
         a, b = (self._half(values, view, RenderRequest(about.sensor, half, spp // 2)) for half in opaque)
         dropped = {}
         begin = 0
