@@ -40,7 +40,7 @@ class Result:
     history: list[Entry]
     """One entry per iteration: loss, seconds, gradient norms and more."""
     stopped: str | None
-    """Why the run ended early: 'a callback', 'Ctrl-C', 'the stop button', or the reason of the optimiser."""
+    """Why the run ended early: 'a callback', 'Ctrl-C', 'the stop button', or the reason why the optimiser stopped."""
     problem: Problem
     folder: Path | None = None
     """Run folder, which contains ``report.html``; None if no files were written."""

@@ -1,7 +1,7 @@
-"""Height map of a lens or mirror whose caustic is an image, from optimal transport: the start of caustic design.
+"""Initial height map for the design of a caustic: a lens or mirror whose caustic is an image, by optimal transport.
 
 Gradients of renderings change a caustic locally, and end in local minima if light has to travel far across the image.
-As in Schwartzburg et al. (2014) and Sun et al. (2024), the start therefore transports the light first:
+The initial height map therefore transports the light first, as in Schwartzburg et al. (2014) and Sun et al. (2024):
 
 1. Optimal transport assigns a point T(x) of the receiver to each point x of the surface.
 2. Snell's law or the law of reflection gives the normal that directs the light at x to T(x).

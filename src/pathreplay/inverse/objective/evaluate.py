@@ -270,7 +270,7 @@ class Evaluator:
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
-        # One bad path must not end a long run. A sum is finite if and only if all entries are; it needs no array.
+        # One bad path must not end a long run. Only finite entries have a finite sum, which needs no temporary array.
         broken = [key for key, gradient in gradients.items() if not np.isfinite(gradient.sum(dtype=np.float64))]
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:

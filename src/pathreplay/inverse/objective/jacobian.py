@@ -22,7 +22,7 @@ from pathreplay.inverse.problem.problem import Problem, scene_values
 from pathreplay.platform import memory
 
 IMAGE = ""
-"""Selects the image itself where a key of a variable selects a derivative."""
+"""Key of the image itself. All other keys are keys of variables, and stand for derivatives."""
 
 
 class Jacobians:

@@ -94,7 +94,7 @@ class Problem:
     baseline: mi.Integrator | None
     """Integrator of a second run, which solves the same problem in the same time for comparison; None without it."""
     judge: mi.Integrator
-    """Integrator of the images in which the results of ``integrator`` and ``baseline`` are compared with the targets.
+    """Integrator that renders images for comparing the results of ``integrator`` and ``baseline`` with the targets.
 
     This is the integrator that rendered the targets, or ``integrator`` if the targets are image files."""
     variables: tuple[Variable, ...]
