@@ -118,7 +118,7 @@ def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[Variant
         if message is None:
             _, message = llvm.run_trial(_PROBE, {"preload": preload, "variant": name}, environment)
             if message:
-                dead[backend] = f"as {name}"
+                dead[backend] = f"not tested, because {name} fails"
         verdicts.append(VariantVerdict(name, not message, message))
     return verdicts
 

@@ -329,7 +329,7 @@ def test_what_is_left_of_a_cluster_ends_and_a_line_says_so(who: str, tmp_path: P
         assert "the process ended during its run" in err
     else:
         assert status == 2 and err.count(ERROR) == 1, err
-        assert f"{ERROR}ray: the cluster is lost" in err and "go on with: pathreplay optimize --resume run" in err
+        assert f"{ERROR}ray: the cluster is lost" in err and "resume with: pathreplay optimize --resume run" in err
     assert gone(tree) and set(Path("/tmp").glob("pathreplay-*")) <= before
 
 

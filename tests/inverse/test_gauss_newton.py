@@ -150,7 +150,7 @@ def test_a_job_that_was_left_goes_on_bit_for_bit(folder: Path) -> None:
 def test_a_job_ends_by_itself_with_a_tolerance(folder: Path) -> None:
     found = run(optimizer={**OPTIMIZER, "tolerance": 1e-4}, iterations=40, output="run")
     assert 2 < found.iterations < 40 and "less than the tolerance" in found.report.read_text()
-    with pytest.raises(PathreplayError, match=r"has ended by itself .*; lower 'tolerance' in its config"):
+    with pytest.raises(PathreplayError, match=r"has terminated .*; lower 'tolerance' in its config"):
         optimize(resume="run", progress=False)
 
 

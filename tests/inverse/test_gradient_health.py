@@ -81,7 +81,7 @@ def test_a_row_of_them_ends_the_run_with_a_checkpoint(spoilt: type[Spoilt]) -> N
         optimize(make_config(job(max_consecutive_nonfinite=3, checkpoint_every=100)), progress=False)
     line = str(told.value)
     assert f"At least half of the gradient of '{KEY}' was NaN or infinite in iterations 2 to 4" in line
-    assert line.endswith("what was done is saved, go on with: pathreplay optimize --resume run")
+    assert line.endswith("all completed iterations are saved, resume with: pathreplay optimize --resume run")
     spoilt.passes = 0
     again = optimize(resume="run", progress=False)
     assert again.iterations == 12 and sum(entry.dropped for entry in again.history) == 9
@@ -103,7 +103,7 @@ def test_a_loss_that_is_no_number_leaves_a_checkpoint(monkeypatch: pytest.Monkey
 
     calls: list[int] = []
     monkeypatch.setattr(Local, "run", run)
-    with pytest.raises(PathreplayError, match=r"The loss is nan at iteration 3;.*go on with: pathreplay optimize"):
+    with pytest.raises(PathreplayError, match=r"The loss is nan at iteration 3;.*resume with: pathreplay optimize"):
         optimize(make_config({**JOB, "output": "run"}), progress=False)
     result = optimize(resume="run", progress=False)
     assert result.iterations == 8 and len(calls) == 4 + 5

@@ -150,7 +150,7 @@ def test_a_job_ends_by_itself_and_at_its_best(transform: str | None, room: Path)
     best = int(np.argmin(losses))
     if best:  # errors are after a step, to the point that the next iteration looks at
         assert result.errors[KEY] == pytest.approx(result.history[best - 1].errors[KEY], rel=1e-4)
-    with pytest.raises(PathreplayError, match=r"has ended by itself .*; lower 'tolerance' in its config"):
+    with pytest.raises(PathreplayError, match=r"has terminated .*; lower 'tolerance' in its config"):
         optimize(resume="run", progress=False)
 
 

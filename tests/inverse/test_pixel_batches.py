@@ -280,7 +280,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         "1024 samples per pixel of 3 vertices are more than the 682 that a record holds; take fewer",
     ),
     "late": ({"stages": [{"iterations": 2}, {"iterations": 1, "max_depth": 1500}]}, "of 1500 vertices"),
-    "camera": (MOVED, "its camera moves; hold 'sensor.to_world', or leave 'pixel_batch_size' out"),
+    "camera": (MOVED, "its camera moves; freeze 'sensor.to_world', or leave 'pixel_batch_size' out"),
 }
 
 

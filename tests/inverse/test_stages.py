@@ -159,14 +159,14 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "none": ({"stages": []}, "'stages'"),
     "empty": ({"stages": [{}]}, "key 'stages.0.iterations' is missing; add it"),
     "misspelt": ({"stages": [{"iterations": 1, "dpp": 3}]}, "unknown key 'stages.0.dpp'; did you mean 'spp'?"),
-    "divisor": ({"stages": [{"iterations": 1, "downscale": 4}]}, "12 x 10 pixels of sensor 'left'; take one of 2"),
-    "no view": ({"stages": [{"iterations": 1, "sensors": ["up"]}]}, "sensor 'up' is none of the job's views"),
+    "divisor": ({"stages": [{"iterations": 1, "downscale": 4}]}, "12 x 10 pixels of sensor 'left'; use one of 2"),
+    "no view": ({"stages": [{"iterations": 1, "sensors": ["up"]}]}, "sensor 'up' is not a view of the job"),
     "held out": (
         {"test_views": ["right"], "stages": [{"iterations": 1, "sensors": ["right"]}]},
-        "sensor 'right' is a test view; name some of left",
+        "sensor 'right' is a test view; name training views: left",
     ),
     "no key": ({"stages": [{"iterations": 1, "parameters": ["flor.*"]}]}, "No parameter 'flor.*'"),
-    "never": ({"stages": [{"iterations": 1, "parameters": [FLOOR]}]}, f"'{TEXTURE}' moves in none of them"),
+    "never": ({"stages": [{"iterations": 1, "parameters": [FLOOR]}]}, f"stages: no stage optimises '{TEXTURE}'"),
     "resolutions": (
         {"parameters": [{"key": TEXTURE, "resolutions": [2, 4]}]},
         "2 resolutions and 0 entries in refine_at",

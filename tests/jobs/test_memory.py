@@ -213,7 +213,7 @@ def test_a_run_beyond_its_budget_ends_with_a_line_and_a_checkpoint(monkeypatch: 
     """Nothing half-written: what was done is there, and the run goes on from it with more memory."""
     sizes = iter([10**8] * 60)
     monkeypatch.setattr(memory, "taken", lambda: next(sizes, 2 * 10**9))
-    with pytest.raises(PathreplayError, match=r"'memory_limit' is 1 GB; .*go on with: pathreplay optimize --resume"):
+    with pytest.raises(PathreplayError, match=r"'memory_limit' is 1 GB; .*resume with: pathreplay optimize --resume"):
         optimize(make_config({**JOB, "memory_limit": "1 GB", "iterations": 40}), output="run", progress=False)
     assert (Path("run") / "checkpoint.safetensors").exists() and not list(Path("run").rglob("*.part"))
 

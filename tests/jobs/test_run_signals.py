@@ -50,7 +50,7 @@ def test_two_ctrl_c_at_once_abort_in_one_line(tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
     status, out, err = ended(process)
     assert (status, out) == (130, "")
-    assert err == "pathreplay: aborted; go on from the last checkpoint with: pathreplay optimize --resume run\n"
+    assert err == "pathreplay: aborted; resume from the last checkpoint with: pathreplay optimize --resume run\n"
     assert not list((tmp_path / "run").rglob("*.part"))
 
 

@@ -341,12 +341,12 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
     ("make", "words"),
     [
         (bad(parameters={"wal.reflectance": GREY}), "wal.reflectance"),
-        (bad(parameters={WALL: 0.5}), "parameters: 0.5 is no Parameter"),
-        (bad(views=np.zeros((16, 16, 3))), "is no View; write View"),
-        (bad(derived={WALL: len}), "is no Derived"),
+        (bad(parameters={WALL: 0.5}), "parameters: 0.5 is not a Parameter"),
+        (bad(views=np.zeros((16, 16, 3))), "is not a View; write View"),
+        (bad(derived={WALL: len}), "is not a Derived"),
         (bad(views=[]), "views: there is none"),
         (bad(views=View(0)), "Target of sensor 'left' is missing"),
-        (bad(views=View(0, np.zeros((3, 4, 3)))), "is 4 x 3, and its film 16 x 16"),
+        (bad(views=View(0, np.zeros((3, 4, 3)))), "is 4 x 3, but its film is 16 x 16"),
         (bad(views=View(0, "no.exr")), "No image file 'no.exr'"),
         (bad(views=View("middle", np.zeros((16, 16, 3)))), "No sensor 'middle'"),
         (bad(views=[View(0, np.zeros((16, 16, 3))), View("left", np.zeros((16, 16, 3)))]), "is named twice"),
@@ -360,7 +360,7 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(parameters={WALL: Parameter(initial=np.zeros(5))}), "of shape \\(5,\\)"),
         (bad(parameters={WALL: Parameter(parameterization="cube")}), "parameterization"),
         (bad(parameters={BODY: Parameter(pose="rigid", initial=np.eye(4))}), "'initial' of a pose is a displacement"),
-        (bad(scene=5), "scene: 'int' is no scene of the active variant"),
+        (bad(scene=5), "scene: 'int' is not a scene of the active variant"),
         (bad(scene={"type": "sphere"}), "describes a Shape, not a scene"),
         (bad(scene="no-such-scene"), "No scene 'no-such-scene'"),
     ],
@@ -380,17 +380,17 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
         (object(), "has no step"),
         (mi.ad.Adam, "is a class; create an object"),
         (unbounded, "BFGS cannot handle bounds; remove the bounds"),
-        (held, "holds variables already"),
+        (held, "already has variables"),
         ("adem", "adem"),
     ):
         with pytest.raises(PathreplayError, match=words):
             pathreplay.minimize(problem, optimizer, progress=False)
     with pytest.raises(PathreplayError, match="No parameter 'x'"):
         problem.render({"x": 1.0})
-    with pytest.raises(PathreplayError, match=r"has the shape \(2,\), the parameter \(3,\); reshape it"):
+    with pytest.raises(PathreplayError, match=r"has the shape \(2,\), not the shape \(3,\); reshape it"):
         pathreplay.value_and_grad(problem)({WALL: [1.0, 2.0]})
     textured = Problem(room(), [TEXTURE], views(photos))
-    with pytest.raises(PathreplayError, match=r"has the shape \(4, 4\), the parameter \(4, 4, 3\)"):
+    with pytest.raises(PathreplayError, match=r"has the shape \(4, 4\), not the shape \(4, 4, 3\)"):
         textured.render({TEXTURE: np.zeros((4, 4))})
     assert textured.render({TEXTURE: np.zeros((8, 8, 3))}, spp=1).shape == (SIDE, SIDE, 3)
     with pytest.raises(PathreplayError, match="'iterations' is 0"):

@@ -134,5 +134,5 @@ def test_what_scenes_cannot_share_is_told() -> None:
         with pytest.raises(PathreplayError, match=words) as told:
             Problem.joint(problems)
         assert "\n" not in str(told.value)
-    with pytest.raises(PathreplayError, match="stages: joint problems support none"):
+    with pytest.raises(PathreplayError, match="stages: joint problems do not support stages"):
         pathreplay.minimize(Problem.joint([one, fine]), stages=[{"iterations": 2}], progress=False)

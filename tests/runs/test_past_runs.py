@@ -165,7 +165,7 @@ def test_films_that_cannot_be_made_are_told(tmp_path: Path, monkeypatch: pytest.
     run = a_run(tmp_path / "a")
     for output, view, words in (
         ("film.gif", None, "neither .webp nor .mp4"),
-        ("film.webp", "top", "no frames of view 'top', but of left, right"),
+        ("film.webp", "top", "no frames of view 'top'; name a view with frames: left, right"),
         ("none/film.webp", None, "cannot be written"),
     ):
         with pytest.raises(PathreplayError, match=words):

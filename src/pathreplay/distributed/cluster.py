@@ -154,7 +154,7 @@ def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
 def _start(ray: ModuleType, stack: contextlib.ExitStack, cores: int) -> Cluster:
     """Start a private cluster, which ends when ``stack`` closes. Raises PathreplayError if Ray cannot start safely."""
     temporary = tempfile.gettempdir()
-    # mkdtemp admits only this user; Ray's default folder admits all. Paths of sockets may have at most 107 characters.
+    # Other users cannot enter a folder of mkdtemp, unlike Ray's default folder. Socket paths have up to 107 characters.
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=temporary if len(temporary) <= _LONGEST_FOLDER else "/tmp")
     guard = Guard(Path(folder))
     stack.callback(guard.close)

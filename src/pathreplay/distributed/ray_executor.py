@@ -1,4 +1,4 @@
-"""Evaluates shards in Ray actors, on this machine or on a cluster, with the same bits as in a single process.
+"""Evaluates shards in Ray actors, on this machine or on a cluster, with the same results as in a single process.
 
 Each actor keeps the scene and the compiled kernels. Large values are sent once per step. `Scheduler` decides which
 actor computes which shard. This choice has no effect on the result: an evaluation is a function of the values, the
@@ -214,7 +214,7 @@ class RayExecutor:
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
         """Yield evaluations in shard order; see `Executor`.
 
-        Raises PathreplayError if all actors are permanently lost, and the errors of evaluations.
+        Raises PathreplayError if all actors are permanently lost. Errors of evaluations are raised again here.
         """
         if not shards:
             return
@@ -260,7 +260,7 @@ class RayExecutor:
             late = len(step.again)
             first = step.next(number, time.monotonic(), idle)
             if first is None:
-                break  # skip the other idle actors: they would hardly get a shard either, and may be many
+                break  # skip the other idle actors, which are unlikely to get a shard and may be many
             self.pool.counts.twice += len(step.again) - late
             indices = (first, *step.along(number, size, len(self.pool.ready)))
             self.pool.ask(

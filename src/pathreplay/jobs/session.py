@@ -28,9 +28,10 @@ class Optimization:
     """A running job: iterating over it yields an `Iteration` after each step.
 
     The scene is loaded when the first iteration is requested. At the end of the loop, all results are written and
-    ``result`` is set. `stop` ends the run early and also writes all results. `close` ends the run with only a
-    checkpoint to resume from. Leaving a ``with`` block has the same effect as `close`, and so has the deletion of the
-    object, for example after the loop is left early. `pathreplay.optimize` describes the effect of signals.
+    ``result`` is set. `stop` ends the run early and also writes all results. `close` ends the run and writes a
+    checkpoint to resume from, but no results. Leaving a ``with`` block has the same effect as `close`. So has the
+    deletion of the object, for example after a loop that was left early. `pathreplay.optimize` describes the effect of
+    signals.
     """
 
     def __init__(self, job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> None:
@@ -71,7 +72,7 @@ class Optimization:
         for _ in self:
             pass
         if self.result is None:
-            raise PathreplayError("The optimization was closed; go on with its run folder: iterate(resume=...)")
+            raise PathreplayError("The optimization was closed; resume it from its run folder: iterate(resume=...)")
         return self.result
 
 

@@ -22,14 +22,15 @@ class Parameter:
     that `mi.traverse` shows.
 
     Args:
-        initial: initial value: a number, a colour, an array in the parameter's shape, or an image or volume file. A
-            pose has a displacement ``{"translation": [x, y, z], "rotation": [rx, ry, rz]}`` (scene units, degrees).
+        initial: initial value: a number, a colour, an array in the parameter's shape, or an image or volume file. For a
+            pose, a displacement ``{"translation": [x, y, z], "rotation": [rx, ry, rz]}`` (scene units, degrees).
             Default: the value in the scene.
         bounds: lower and upper bound, enforced by projection after each step.
-        learning_rate: learning rate; with Adam, approximately the length of a step. Default: that of the problem.
+        learning_rate: learning rate; with Adam, approximately the length of a step. Default: the learning rate of the
+            problem.
         parameterization: ``"log"``, ``"softplus"`` or ``"logit"``: steps are taken in this function of the value.
-        resolutions: sizes of a grid, coarse to fine.
-        refine_at: iterations at which the grid is refined.
+        resolutions: resolutions of a grid, coarse to fine, as the number of entries along its longest axis.
+        refine_at: first iteration of the second and each later resolution.
         pyramid: take steps in the levels of a Laplacian pyramid of a texture or volume.
         pose: motion of a ``to_world`` or of ``vertex_positions``: ``"translation"``, ``"rotation"`` or ``"rigid"``.
         pivot: centre of the rotation of a pose.
@@ -67,9 +68,9 @@ class Derived:
     """A scene parameter that is computed from other parameters.
 
     Args:
-        function: its value is ``function(initial, *inputs)``, where ``initial`` is the value in the scene and
-            ``inputs`` are the values of the parameters in ``of``.
-        of: names of the parameters.
+        function: function that computes the value as ``function(initial, *inputs)``. Here ``initial`` is the value in
+            the scene, and ``inputs`` are the values of the parameters in ``of``.
+        of: names of the other parameters.
         displace: in place of a function, options of a displacement of ``vertex_positions`` by the height maps in
             ``of``: ``direction``, ``coordinates``, ``interpolation`` and ``weights``, as in a job. ``{}`` displaces
             along the normals, with texture coordinates.
@@ -107,7 +108,7 @@ def require_kinds(wanted: Mapping[str, Parameter | None], views: Sequence[View],
         ("derived", Derived, list(made.values())),
     ):
         if wrong := [each for each in things if not isinstance(each, kind)]:
-            raise PathreplayError(f"{what}: {shown(wrong[0])} is no {kind.__name__}; write {kind.__name__}(...)")
+            raise PathreplayError(f"{what}: {shown(wrong[0])} is not a {kind.__name__}; write {kind.__name__}(...)")
 
 
 def by_key(parameters: Mapping[str, Parameter | None] | Sequence[str] | str) -> dict[str, Parameter | None]:

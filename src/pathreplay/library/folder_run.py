@@ -55,7 +55,7 @@ class FolderRun:
     @property
     def remedy(self) -> str:
         """Return the message for an aborted run, with the command that resumes it."""
-        return f"aborted; go on from the last checkpoint with: {self.folder.resume_command()}"
+        return f"aborted; resume from the last checkpoint with: {self.folder.resume_command()}"
 
     def observe(self, event: Event) -> None:
         """Write the checkpoint, page and previews that are due after an event.
@@ -81,7 +81,7 @@ class FolderRun:
             if self._is_new and not self._run.history and not self._stop.aborted:
                 self.folder.remove()
             elif self._saving.rescued() and not self._stop.aborted:
-                remedy = f"what was done is saved, go on with: {self.folder.resume_command()}"
+                remedy = f"all completed iterations are saved, resume with: {self.folder.resume_command()}"
                 raise PathreplayError(f"{error}; {remedy}") from error
             raise
 
@@ -134,7 +134,7 @@ def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
     name = f"Run {folder.name}"
     if run.optimiser.finished:
         remedy = "lower the optimizer's tolerance" if folder.in_python else "lower 'tolerance' in its config"
-        raise PathreplayError(f"{name} has ended by itself ({run.optimiser.finished}); {remedy}")
+        raise PathreplayError(f"{name} has terminated ({run.optimiser.finished}); {remedy}")
     if len(run.history) >= config.iterations:
         remedy = "raise 'steps'" if folder.in_python else "raise 'iterations' in its config"
         raise PathreplayError(f"{name} has all its {len(run.history)} iterations; {remedy}")

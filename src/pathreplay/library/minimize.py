@@ -40,7 +40,7 @@ class Result:
     history: list[Entry]
     """One entry per iteration: loss, seconds, gradient norms and more."""
     stopped: str | None
-    """Why the run ended early: 'a callback', 'Ctrl-C', 'the stop button', or the reason of the optimiser."""
+    """Why the run ended early: 'a callback', 'Ctrl-C', 'the stop button', or the reason why the optimiser stopped."""
     problem: Problem
     folder: Path | None = None
     """Run folder, which contains ``report.html``; None if no files were written."""
@@ -187,7 +187,7 @@ def _folder_run(
     job: Job, built: inner.Problem, run: Run, stop: Stop, output: Path, resume: bool, stack: ExitStack
 ) -> FolderRun:
     """Create or resume the run folder."""
-    run.optimiser.state()  # raises if the user's optimizer cannot be saved
+    run.optimiser.state()  # raises PathreplayError if the state of the user's optimizer cannot be saved
     resumed = None
     if resume and output.exists():
         _, resumed = open_run_folder(output, job.in_python)

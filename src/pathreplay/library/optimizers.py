@@ -36,14 +36,14 @@ class Stepper(Protocol):
 class OfMitsuba:
     """An optimiser of `mitsuba.ad` or `drjit.opt`.
 
-    Variables in ``own`` use the learning rates of the problem. Other variables use that of the optimiser.
+    Variables in ``own`` use their learning rates in the problem. Other variables use the optimiser's learning rate.
     """
 
     finished = ""
 
     def __init__(self, optimizer: Any, values: Arrays, own: Collection[str]) -> None:
         if any(True for _ in optimizer.keys()):
-            raise PathreplayError("optimizer: it holds variables already; give an empty one")
+            raise PathreplayError("optimizer: it already has variables; give an optimizer without variables")
         self._optimizer, self._own, self._steps = optimizer, own, dict.fromkeys(values, 0)
         for key, value in values.items():
             optimizer[key] = mi.TensorXf(value)

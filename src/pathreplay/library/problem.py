@@ -238,7 +238,7 @@ class Problem:
         fitting = [each for each in found if each.keys() <= set(params.keys())]
         if not fitting:
             missing = next(key for key in found[0] if key not in params)
-            raise PathreplayError(f"The scene has no parameter '{missing}'; give one that is built alike")
+            raise PathreplayError(f"The scene has no parameter '{missing}'; give a scene with the problem's parameters")
         for each in fitting:
             for key, value in each.items():
                 params[key] = value
@@ -261,7 +261,7 @@ def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
     array = np.array(dr.detach(value) if dr.is_array_v(value) else value, np.float32)
     resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
     if array.shape != wanted and not resized and not (len(wanted) == 1 and array.size == wanted[0]):
-        raise PathreplayError(f"Value of '{key}' has the shape {array.shape}, the parameter {wanted}; reshape it")
+        raise PathreplayError(f"Value of '{key}' has the shape {array.shape}, not the shape {wanted}; reshape it")
     return array if resized else array.reshape(wanted)
 
 
@@ -274,7 +274,7 @@ def _loaded(scene: object, job: Json, base: Path) -> tuple[mi.Scene, tuple[str, 
         return scene, ()
     if not isinstance(scene, (Mapping, str, Path)):
         raise PathreplayError(
-            f"scene: {shown(type(scene).__name__)} is no scene of the active variant, {mi.variant()}; load it in "
+            f"scene: {shown(type(scene).__name__)} is not a scene of the active variant, {mi.variant()}; load it in "
             "this variant, or give a dictionary, a file or the name of a built-in scene"
         )
     tables = [*job.get("parameters", []), *job.get("derived", [])]

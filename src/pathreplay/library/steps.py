@@ -46,7 +46,7 @@ class _Task:
         if self.optimiser is None or self.at is not state:
             self.optimiser = self.own or optimiser_of(built, state._next, built.config.optimizer)
             self.optimiser.restore(state._kept, latents(built.variables, state._next))
-        self.at = None  # the optimiser matches no State until the step has succeeded
+        self.at = None  # if the step fails, the optimiser is in the state of no `State`
         return self.optimiser
 
 

@@ -40,8 +40,8 @@ def targets_of(scene: mi.Scene, views: Mapping[str, View]) -> Targets:
         image = _pixels(what, view.target)
         if image.shape[:2] != (height, width):
             raise PathreplayError(
-                f"{what} is {image.shape[1]} x {image.shape[0]}, and its film {width} x {height}; resize the image or "
-                "the film"
+                f"{what} is {image.shape[1]} x {image.shape[0]}, but its film is {width} x {height}; resize the image "
+                "or the film"
             )
         images[name] = adapted_image(what, image, "the film has", channels)
         if view.weight is not None:
@@ -63,7 +63,7 @@ def _pixels(what: str, value: object) -> Image:
     try:
         image = np.array(value, np.float32)
     except (TypeError, ValueError) as error:
-        raise PathreplayError(f"{what} is no image ({error}); give an array, a mi.Bitmap or a file") from None
+        raise PathreplayError(f"{what} is not an image ({error}); give an array, a mi.Bitmap or a file") from None
     image = image[:, :, None] if image.ndim == 2 else image
     if image.ndim != 3:
         raise PathreplayError(f"{what} has the shape {image.shape}; give (height, width, channels)")

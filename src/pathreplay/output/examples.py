@@ -11,7 +11,7 @@ from pathreplay.platform.atomic_files import whole_folder
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _SOURCES = (".exr", ".md", ".py", ".sh", ".toml", ".xml")
-"""Suffixes of the sources. Results that examples have written in a checkout are in folders of their own, or are PNG."""
+"""Suffixes of source files. In a checkout, examples may have written results: PNG files, or files in subfolders."""
 
 
 def example_files() -> list[Path]:

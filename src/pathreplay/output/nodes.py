@@ -156,7 +156,7 @@ def _deepest(described: Described, owner: Owner) -> Owner:
     if not dot:
         return owner
     children = dict(described.children(owner.node))
-    if name not in children:  # the path has another name than the description: choose the only bitmap
+    if name not in children:  # the path and the description use different names: choose the only bitmap
         pictures = [child for child in children.values() if child.props.plugin_name() == "bitmap"]
         if rest.split(".")[-1] != "data" or len(pictures) != 1:
             return owner

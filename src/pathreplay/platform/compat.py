@@ -1,14 +1,14 @@
-"""The two forms of Mitsuba's interface that differ between version 3.9 and its successor, behind one name each.
+"""Functions that hide the differences between the interfaces of Mitsuba 3.9 and 3.10.
 
-Version 3.9 is supported. The forms of 3.10 are those of its development branch. Which form applies is decided by the
-names that Mitsuba has, not by its version.
+Version 3.9 is supported. Code for 3.10 follows its development branch. The functions test which names Mitsuba provides,
+and ignore its version number.
 
 - Flags of `compute_surface_interaction`: 3.10 has ``Minimal``, ``Shading`` (alias ``Default``) and ``NormalPartials``
   only, and tangents are not part of ``Minimal``.
 - Meshes: 3.9 has flat arrays such as ``vertex_positions``; 3.10 has tensors such as ``positions``, with one row per
   point. In 3.10, vertices can refer to positions and normals through index maps, which are empty by default.
-- Silhouettes: 3.10 prepares them lazily, for meshes whose positions have gradients. No other module samples Mitsuba's
-  silhouettes, so this needs no second form.
+- Silhouettes: 3.10 prepares them lazily, for meshes whose positions have gradients. This has no effect, because
+  pathreplay does not sample Mitsuba's silhouettes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FACES = "faces"
 _SHADING = "Default"  # the flag of 3.10
 _FROM_FIELDS = "from_fields"  # the method of 3.10 that fills a mesh
 _PREFIXES = "vertex_", "face_"
-_SPACE = 64  # numbers behind the values of an array
+_SPACE = 64  # number of entries that are allocated after the values of an array
 _OTHERS = _FACES, "bsdf_index", "position_index", "normal_index"
 
 
@@ -75,14 +75,14 @@ def shading() -> int:
 def normal_partials() -> int:
     """Flags of an interaction that also has derivatives of the normal.
 
-    In 3.9, the derivatives are those of the geometric normal, in 3.10 those of the shading normal. On shapes other than
+    These are derivatives of the geometric normal in 3.9, and of the shading normal in 3.10. On shapes other than
     meshes, both are equal.
     """
     return _detail(mi.RayFlags).normal_partials
 
 
 def follow_shape() -> int:
-    """Flag of an interaction whose derivatives are those of a point with fixed surface coordinates."""
+    """Flag of an interaction that is differentiated at fixed surface coordinates, so that it follows the shape."""
     return _detail(mi.RayFlags).follow_shape
 
 
@@ -107,7 +107,7 @@ def triangle_sides(
         a, b, c = triangle_corners(hit, ray, active)
         return b - a, c - a
     si = hit.compute_surface_interaction(ray, minimal() | follow_shape(), active)
-    return si.dp_du, si.dp_dv  # without texture coordinates, they are the sides
+    return si.dp_du, si.dp_dv  # the tangents are the sides if texture coordinates are not requested
 
 
 class MeshArrays(NamedTuple):
@@ -124,7 +124,7 @@ class MeshArrays(NamedTuple):
 
 
 def mesh_arrays(params: Mapping[str, object]) -> MeshArrays | None:
-    """Return the data of a mesh, or None if its positions are not accessible, as those of a rectangle.
+    """Return the data of a mesh, or None for a shape whose positions are not accessible, such as a rectangle.
 
     Args:
         params: ``mi.traverse(mesh)``.
@@ -135,7 +135,7 @@ def mesh_arrays(params: Mapping[str, object]) -> MeshArrays | None:
     at = _index(params, "position_index", len(positions))
     normals, texcoords = _rows(params, NORMALS, 3), _rows(params, TEXCOORDS, 2)
     if len(normals):
-        # An empty map of normals is the map of positions, if there are as many normals as positions.
+        # If the map of normals is empty, and there are as many normals as positions, the map of positions applies.
         with_positions = len(normals) == len(positions)
         normals = normals[_index(params, "normal_index", len(normals), at if with_positions else None)]
     return MeshArrays(np.array(params[_FACES]).reshape(-1, 3), positions[at], normals, texcoords)
@@ -173,7 +173,7 @@ def is_positions(key: str) -> bool:
 
 
 def faces_of_positions(params: Mapping[str, object], key: str) -> NDArray[np.integer] | None:
-    """Return the faces (m, 3) of a mesh as indices into its positions; None if ``key`` is no positions of a mesh."""
+    """Return the faces (m, 3) of a mesh as indices into its positions; None if ``key`` is another kind of parameter."""
     owner, dot, _ = key.rpartition(".")
     faces, index = f"{owner}{dot}{_FACES}", f"{owner}{dot}position_index"
     if not is_positions(key) or faces not in params:
@@ -196,7 +196,7 @@ def points_of(positions: dr.ArrayBase) -> mi.Vector3f:
 
 
 def positions_like(positions: dr.ArrayBase, points: mi.Vector3f) -> dr.ArrayBase:
-    """Return points in the form of the positions of a mesh, which is that of ``positions``."""
+    """Convert points to the type and shape of ``positions``, which are positions of a mesh."""
     flat: mi.Float = dr.ravel(points)
     return mi.TensorXf(flat, shape=positions.shape) if dr.is_tensor_v(positions) else flat
 
@@ -213,10 +213,10 @@ def has_normals(mesh: mi.Mesh) -> bool:
 
 
 def _with_space(values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Return the values in memory that continues behind them.
+    """Copy the values into a larger allocation.
 
-    Dr.Jit uses the memory of a NumPy array in place. On LLVM it reads whole packets of numbers, also beyond the end,
-    which ends the process if the array ends with a page of memory.
+    Dr.Jit uses the memory of a NumPy array in place. On LLVM, it reads whole packets, which may extend beyond the end
+    of the array. This crashes the process if the array ends at the end of a memory page.
     """
     result = np.zeros(values.size + _SPACE, values.dtype)
     result[: values.size] = values

@@ -9,7 +9,7 @@ import numpy as np
 
 from pathreplay.report.drawing import Figure, own_settings
 
-# Percentile of the absolute finite differences at the end of the colour scale; few pixels are larger.
+# The end of the colour scale, as a percentile of the absolute finite differences. Few pixels exceed it.
 _PERCENTILE = 99.0
 
 

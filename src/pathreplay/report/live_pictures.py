@@ -70,7 +70,7 @@ class LivePictures:
 
     def is_due(self, seconds: float) -> bool:
         """Return whether images are due after an iteration that took ``seconds``."""
-        # Until the first images are rendered, their cost is assumed to be that of an iteration, which is higher.
+        # Before the first images are rendered, their cost is estimated by the time of an iteration, an upper bound.
         allowed = self.share * (time.perf_counter() - self._began)
         return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
 

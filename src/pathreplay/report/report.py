@@ -299,7 +299,7 @@ def _plain(axes: Axes, along: str) -> None:
 # Largest number of views, and of textures and volumes, in summary.png.
 SUMMARY_ROWS = 3
 SUMMARY_SIDE = 512
-"""Pixels. Larger images are first downscaled to this side to save memory, and then drawn with a width of 210 pixels."""
+"""Side in pixels to which larger images are downscaled, to save memory. Images are drawn with a width of 210 pixels."""
 
 
 def summary(outcome: Outcome) -> bytes:

@@ -230,7 +230,7 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
 
 
 class _Origin(BaseModel):
-    """Content of run.json; ``config`` is the path of the config file, and the other fields are those of `Job`."""
+    """Content of run.json. ``config`` is the path of the config file. The other fields are described in `Job`."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
@@ -320,7 +320,7 @@ def new_output(output: str | Path | None, source: Path | None) -> Path:
     path = Path(output)
     require_writable_name(path, "--output")
     if not str(output) or path.name in ("", ".."):
-        raise PathreplayError(f"Run folder '{output}' has no name of its own; give --output a new name, as runs/mine")
+        raise PathreplayError(f"Run folder '{output}' has no name of its own; give --output a new name: runs/mine")
     if os.path.lexists(path) and not path.is_dir():
         raise PathreplayError(f"Run folder {path} cannot be created: a file has that name; give another --output")
     return path

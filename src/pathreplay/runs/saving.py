@@ -114,8 +114,8 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
             path = folder / _picture(kind, view.name)
             if image.shape != wanted:
                 raise PathreplayError(
-                    f"{path} has shape {image.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
-                    "start a new run"
+                    f"{path} has shape {image.shape} (height, width, channels), but sensor '{view.name}' renders "
+                    f"{wanted}; start a new run"
                 )
             require_finite_array(str(path), image)
     for name, saved in _runs(run).items():

@@ -33,7 +33,7 @@ def ball(splits: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def knobs(directions: np.ndarray) -> np.ndarray:
-    """Return the points (n, 3) of a body with four different knobs in these directions. The body has length 1."""
+    """Return the surface points (n, 3) of a body with four knobs, in these ``directions``. The body has length 1."""
     radius = np.full(len(directions), 0.4)
     for at, height, sharpness in _KNOBS:
         radius += height * np.exp(sharpness * (directions @ (np.array(at) / np.linalg.norm(at)) - 1))

@@ -74,7 +74,7 @@ def _room(radius: float) -> SceneDict:
     v, u = _centres(64, 128)
     θ, φ = np.pi * v, 2 * np.pi * u
     d = np.stack([np.sin(θ) * np.cos(φ), np.sin(θ) * np.sin(φ), np.cos(θ)], axis=-1)
-    random = np.random.default_rng(7)  # any fixed pattern will do
+    random = np.random.default_rng(7)  # an arbitrary fixed seed
     k = random.normal(size=(3, 6, 3))
     k *= random.uniform(4.0, 12.0, (3, 6, 1)) / np.linalg.norm(k, axis=-1, keepdims=True)
     waves = np.cos(np.einsum("rcx,nwx->rcnw", d, k) + random.uniform(0, 2 * np.pi, (3, 6)))
@@ -331,7 +331,7 @@ def _cumulus(size: int) -> np.ndarray:
     ):  # fmt: skip
         shape += np.exp(-(np.square(x - cx) + np.square(y - cy) + np.square(z - cz)) / radius**2)
     shape *= 1 / (1 + np.exp(-(y + 0.45) / 0.06))  # cut off the blobs at a flat base
-    random = np.random.default_rng(5)  # any fixed pattern will do
+    random = np.random.default_rng(5)  # an arbitrary fixed seed
     k = random.normal(size=(12, 3))
     k *= (2 * np.pi / random.uniform(0.5, 1.2, (12, 1))) / np.linalg.norm(k, axis=1, keepdims=True)
     phase = random.uniform(0, 2 * np.pi, 12)

@@ -32,15 +32,15 @@ def caustic_lens(  # noqa: PLR0913 (keywords of a job)
 ) -> SceneDict:
     """Describe a glass slab between a light and a white receiver, on which the slab casts a caustic.
 
-    The slab has the width 1 and the thickness 0.2. Its exit surface is in the plane z = 0, and `slab` makes it for a
+    The slab has the width 1 and the thickness 0.2. Its exit surface is in the plane z = 0. `slab` creates it for a
     height map of ``rows`` x ``columns``. The receiver is at z = ``distance``. Collimated light falls perpendicularly on
-    the whole entry surface, or light comes from a point at ``source_distance`` from it. A black frame then stops the
-    light that would miss the exit surface. ``irradiance`` is the irradiance of the entry surface; for a point light, at
-    its centre.
+    the whole entry surface. With ``source_distance``, a point light at this distance from the entry surface replaces
+    it, and a black frame blocks the light that would miss the exit surface. ``irradiance`` is the irradiance at the
+    centre of the entry surface.
 
-    The camera sees the part of the receiver that is ``receiver_width`` wide, with x to the right and y down. It stands
-    halfway between slab and receiver and hides neither. The key is ``lens.vertex_positions``. The attributes of the
-    mesh for displacements are ``vertex_weight`` and, with ``two_surfaces``, ``vertex_entry_weight``.
+    The camera sees a part of the receiver of width ``receiver_width``, with x to the right and y down. It is halfway
+    between slab and receiver, and casts no shadow. The key is ``lens.vertex_positions``. The attributes of the mesh for
+    displacements are ``vertex_weight`` and, with ``two_surfaces``, ``vertex_entry_weight``.
     """
     high = rows / columns
     glass = {"type": "dielectric", "int_ior": eta, "ext_ior": 1.0}
@@ -67,13 +67,13 @@ def caustic_mirror(
 ) -> SceneDict:
     """Describe a mirror that reflects light onto a white receiver, on which it casts a caustic.
 
-    The mirror has the width 1 and faces +z in the plane z = 0. `sheet` makes it for a height map of ``rows`` x
-    ``columns``. Light falls on it along (sin α, 0, -cos α), where α is ``angle`` in degrees. It is collimated, or comes
-    from a point at ``source_distance`` from the centre of the mirror. ``irradiance`` is the irradiance of a plane
-    perpendicular to the light, at the centre of the mirror. The receiver is parallel to the mirror at z = ``distance``,
-    and is centred where a flat mirror reflects the light of its own centre.
+    The mirror has the width 1 and faces +z in the plane z = 0. `sheet` creates it for a height map of ``rows`` x
+    ``columns``. Light arrives along (sin α, 0, -cos α), where α is ``angle`` in degrees. The light is collimated, or
+    comes from a point at ``source_distance`` from the centre of the mirror. ``irradiance`` is the irradiance of a plane
+    perpendicular to the light, at the centre of the mirror. The receiver is parallel to the mirror at z = ``distance``.
+    Its centre is the point to which a flat mirror reflects the light that arrives at the centre of the mirror.
 
-    The camera sees the part of the receiver that is ``receiver_width`` wide, with x to the right and y down. The key is
+    The camera sees a part of the receiver of width ``receiver_width``, with x to the right and y down. The key is
     ``mirror.vertex_positions``.
     """
     if not 10 <= angle <= 80:
@@ -85,13 +85,13 @@ def caustic_mirror(
     half = _half(rows, columns)
     if source_distance is not None:
         return scene | {"lamp": _point(-source_distance * along, along, half, 0.0, irradiance)}
-    # Light falls on all of the mirror wherever it is displaced to, and the lamp is beside the reflected light.
+    # The beam is wider than the mirror, and also covers a displaced mirror. The lamp does not block reflected light.
     half = half * [np.cos(α), 1] + 0.1
     return scene | {"lamp": _collimated(-2 * _WIDTH / np.sin(α) * along, along, half, irradiance)}
 
 
 def _observed(resolution: int, high: float, distance: float, receiver_width: float, x: float) -> SceneDict:
-    """Describe the camera and the receiver, whose centre is (x, 0, ``distance``); ``high`` is height over width."""
+    """Describe the camera, and the receiver centred at (x, 0, ``distance``). ``high`` is height divided by width."""
     T = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": resolution, "height": round(resolution * high), "pixel_format": "luminance"}
     return {
@@ -113,7 +113,7 @@ def _observed(resolution: int, high: float, distance: float, receiver_width: flo
 
 
 def _half(rows: int, columns: int) -> Array:
-    """Return half the width and half the height of a surface of width 1, which ends half a cell before its map."""
+    """Return half the width and height of a surface whose map has width 1. It ends half a cell inside the map."""
     return np.array([columns - 1, rows - 1]) / columns * _WIDTH / 2
 
 
@@ -167,9 +167,9 @@ def _at_entry(r: float, s: float, eta: float) -> float:
 def sheet(rows: int, columns: int, width: float, bsdf: dict[str, object]) -> mi.Mesh:
     """Create a rectangle that faces +z, for displacement by a height map of ``rows`` x ``columns``.
 
-    The map has square cells and is centred at the origin of the plane z = 0; ``width`` is the width of all its columns.
-    The rectangle has a vertex at the centre of each cell, so it ends half a cell before the map. Its texture
-    coordinates are those of the map, and its normals are smooth.
+    The map has square cells and is centred at the origin of the plane z = 0. Its total width is ``width``. The
+    rectangle has a vertex at the centre of each cell, so it ends half a cell inside the map. Its texture coordinates
+    are the coordinates on the map, and it has vertex normals.
 
     Raises PathreplayError if there are fewer than two rows or columns.
     """
@@ -230,7 +230,7 @@ def _grid(rows: int, columns: int, width: float) -> tuple[Array, NDArray[np.inte
 
 
 def _mesh(vertices: Array, faces: NDArray[np.integer], width: float, high: float, bsdf: dict[str, object]) -> mi.Mesh:
-    """Create a mesh whose texture coordinates span the map of this width; ``high`` is height over width."""
+    """Create a mesh whose texture coordinates are the coordinates on its map. ``high`` is height divided by width."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
     texcoords = vertices[:, :2] / np.array([width, width * high]) + 0.5

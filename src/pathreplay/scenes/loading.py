@@ -166,7 +166,7 @@ def builtin_dict(name: str, parameters: Mapping[str, object]) -> SceneDict:
         if remedy := _remedy(kind, value):
             raise PathreplayError(f"{what}; give {remedy}")
         if key in COSTS:
-            assert isinstance(value, int)  # by `_remedy`
+            assert isinstance(value, int)  # `_remedy` has checked the type
             memory.require(COSTS[key](value), f"{what} and", "give a smaller number")
     return make(**parameters)
 

@@ -168,7 +168,7 @@ def _wrong_length(path: Path, shape: list[int]) -> PathreplayError:
 
 def _read_vol(path: Path, grid: str | None) -> Volume:
     if grid is not None:
-        raise PathreplayError(f"Volume {path} was asked for grid '{grid}', but a .vol file holds one without name")
+        raise PathreplayError(f"Volume {path} has no grid '{grid}': the grid of a .vol file has no name; omit the name")
     if (header := _vol_header(path)) is None:
         raise PathreplayError(f"Volume {path} is not a Mitsuba volume of version 3; write it with mi.VolumeGrid.write")
     encoding, x, y, z, channels, *box = header
@@ -283,7 +283,7 @@ def _size(where: str, low: np.ndarray, high: np.ndarray, most: int = _MOST_VOXEL
     shape = tuple(int(n) for n in np.asarray(high, np.int64) - low + 1)
     if min(shape) < 1 or np.prod(shape, dtype=np.float64) > most:
         spans = " x ".join(map(str, shape))
-        raise PathreplayError(f"{where} spans {spans} voxels, which is none or more than {most}; crop it first")
+        raise PathreplayError(f"{where} spans {spans} voxels; crop it to at least 1 and at most {most} voxels")
     return shape
 
 

@@ -61,8 +61,8 @@ def derivative_images(  # noqa: PLR0913 (all but two are keyword-only)
     Returns:
         Both images.
 
-    Not differentiated: what the integrator leaves out. Forward mode of the integrator is used, which not every
-    integrator of Mitsuba has.
+    The forward derivative lacks the terms that the integrator omits. The integrator must support forward mode, which
+    some integrators of Mitsuba do not.
 
     Raises:
         PathreplayError: a parameter without derivative, or an integrator that cannot differentiate it in forward mode.

@@ -81,8 +81,8 @@ def test_targets_are_rendered_as_the_job_renders(given: dict[str, Any] | None) -
 @pytest.mark.parametrize(
     ("asked", "told"),
     [
-        ({"max_depth": 6, "hide_emitters": True}, "max_depth = 6 instead of 2"),
-        ({"max_depth": 2}, "hide_emitters = False instead of True"),
+        ({"max_depth": 6, "hide_emitters": True}, "with max_depth = 6, but the job's 'pathreplay' has max_depth = 2; "),
+        ({"max_depth": 2}, "with hide_emitters = False, but the job's 'pathreplay' has hide_emitters = True; "),
         ({"max_depth": 2, "hide_emitters": True}, ""),
     ],
 )

@@ -373,8 +373,8 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "both": (changed(function="own:f"), "has both 'function' and 'displace'; give one of them"),
     "neither": (changed(displace=None), "has neither 'function' nor 'displace'; give one of them"),
-    "two maps": (changed(of=["heights", "more"]), "'of' names 2 height maps, but displace.weights 1; give a list"),
-    "a map too few": (of(weights=["vertex_other"] * 2), "'of' names 1 height maps, but displace.weights 2; give a"),
+    "two maps": (changed(of=["heights", "more"]), "'of' names 2 height maps, but displace.weights names 1 attr"),
+    "a map too few": (of(weights=["vertex_other"] * 2), "'of' names 1 height maps, but displace.weights names 2 a"),
     "no list": (of(weights=[]), "'derived.0.displace.weights'"),
     "no attribute of two": (
         changed(of=["heights", "heights"], displace={"coordinates": "xy", "weights": ["vertex_one", "vertex_w"]}),

@@ -1,1 +1,1 @@
-"""Start of caustic design: optimal transport of light to an image, and the surface that directs it there."""
+"""Initial surfaces for caustic design: optimal transport of light to an image, and the surface that casts it."""

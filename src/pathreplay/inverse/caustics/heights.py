@@ -1,16 +1,17 @@
-"""Height map of a lens or mirror whose caustic is an image, from optimal transport: the start of caustic design.
+"""Initial height map for the design of a caustic: a lens or mirror whose caustic is an image, by optimal transport.
 
 Gradients of renderings change a caustic locally, and end in local minima if light has to travel far across the image.
-As in Schwartzburg et al. (2014) and Sun et al. (2024), the start therefore transports the light first:
+The initial height map therefore transports the light first, as in Schwartzburg et al. (2014) and Sun et al. (2024):
 
 1. Optimal transport assigns a point T(x) of the receiver to each point x of the surface.
 2. Snell's law or the law of reflection gives the normal that directs the light at x to T(x).
-3. The heights are those whose slopes are closest to these normals in the mean square.
+3. A Poisson equation gives the heights. They minimise the mean squared difference between the slopes of the heights
+   and the slopes that belong to the normals.
 
-The transport minimises the mean square of the slopes that shift the light, for small slopes. The normals of step 2 are
-then close to those of a surface.
+For small slopes, the shift of the light on the receiver is proportional to the slope. The transport then minimises the
+mean square slope. Its map is a gradient, so the slopes of step 2 are nearly the gradient of a height map.
 
-Normals of step 2 depend on the heights, so steps 2 and 3 are repeated. Fresnel reflection is ignored.
+The normals of step 2 depend on the heights, so steps 2 and 3 are repeated. Fresnel reflection is ignored.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from pathreplay.inverse.caustics.optics import Optics
 from pathreplay.platform import memory
 
 _A_CELL = 800
-"""Bytes per cell of the height map that the transport takes at its peak."""
+"""Peak memory of the transport, in bytes per cell of the height map."""
 _MARGIN = 1e-9
-"""Width of the border of a triangle that counts as its interior, relative to its size."""
+"""Tolerance of the test whether a point is inside a triangle, in barycentric coordinates."""
 _ROUNDS = 5
-"""Repetitions of steps 2 and 3, and of step 1 if the light that a point receives depends on the heights."""
+"""Number of executions of steps 2 and 3. Step 1 is also repeated if the incident light depends on the heights."""
 
 
 def caustic_heights(
@@ -48,8 +49,8 @@ def caustic_heights(
         image: irradiance (rows, columns), nonnegative; its scale is arbitrary.
         optics: arrangement of light, slab or mirror, and receiver.
         shape: rows and columns of the heights; default: the shape of the image. The image is resampled to this shape.
-        floor: fraction of the light that is distributed evenly. Without it, no continuous surface could leave parts of
-            the image black.
+        floor: fraction of the light that is distributed evenly over the image. It must be above 0, because the caustic
+            of a continuous surface has no black parts.
 
     Returns:
         Heights of shape (rows, columns, 1) and mean zero, positive towards the receiver.
@@ -69,7 +70,7 @@ def caustic_heights(
         incoming, flux = optics.incidence(x, y, h)
         if n == 0 or optics.depends_on_heights:
             slope_y, slope_x = np.gradient(h, cell)
-            # A surface takes more light of a plane the more it turns to the light.
+            # Convert the flux through the plane z = const to the flux on the tilted surface above the same area.
             flux = flux * (1 - (incoming[..., 0] * slope_x + incoming[..., 1] * slope_y) / incoming[..., 2])
             _require_lit(flux)
             φ = potential(density / _at(flux, *_sources(φ, aspect)), φ, aspect)
@@ -85,7 +86,7 @@ def caustic_heights(
 
 
 def _density(image: ArrayLike, shape: tuple[int, int] | None, floor: float) -> Field:
-    """Return the image in another shape, with a mean of 1 and a part ``floor`` that is even."""
+    """Resample the image to ``shape``, and return (1 - floor) times the image with mean 1, plus ``floor``."""
     density = np.asarray(image, np.float64)
     if density.ndim == 3 and density.shape[2] == 1:
         density = density[..., 0]
@@ -118,10 +119,11 @@ def _resampled(density: Field, shape: tuple[int, int]) -> Field:
 
 
 def _sources(φ: Field, aspect: float, margin: int = 0) -> tuple[Field, Field]:
-    """Return the point S(y) of the surface for each cell of the receiver, in cells: rows and columns.
+    """Return the point S(y) of the surface whose light arrives at y, for each cell y of the receiver.
 
-    S is the gradient of the potential for cells with the width ``aspect`` and the height 1, shrunk to the surface. With
-    a ``margin``, also for cells beyond the border, where S is mirrored.
+    Rows and columns are in units of cells. S is the gradient of the potential v (see `monge_ampere`) for cells of width
+    ``aspect`` and height 1, scaled to the extent of the surface. A ``margin`` adds cells beyond the border, for which
+    the potential is mirrored.
     """
     p = np.pad(φ, margin + 1, mode="symmetric")
     rows, columns = (np.arange(-margin, n + margin) for n in φ.shape)
@@ -131,11 +133,11 @@ def _sources(φ: Field, aspect: float, margin: int = 0) -> tuple[Field, Field]:
 
 
 def _receivers(φ: Field, aspect: float) -> tuple[Field, Field]:
-    """Return the point T(x) of the receiver for each cell of the surface, in cells: the inverse of `_sources`.
+    """Return the point T(x) of the receiver for each cell x of the surface, in cells. T is the inverse of `_sources`.
 
-    S maps the squares between cells of the receiver to quadrilaterals that cover the exit surface. T is linear in each
-    of their two triangles. (A Delaunay triangulation of the corners takes minutes where S is close to the identity,
-    because the corners of squares lie on circles.)
+    S maps each square of four neighbouring cell centres of the receiver to a quadrilateral. The quadrilaterals cover
+    the surface. T is linear in each of the two triangles of a quadrilateral. (A Delaunay triangulation of the corners
+    takes minutes where S is close to the identity, because the corners of squares lie on circles.)
     """
     shape = np.array(φ.shape)
     points = np.stack(_sources(φ, aspect, 1), -1)
@@ -145,7 +147,7 @@ def _receivers(φ: Field, aspect: float) -> tuple[Field, Field]:
     a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel()
     triangles = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
     corners = points.reshape(-1, 2)[triangles]
-    # All cells in the bounding box of each triangle, one after another.
+    # List the cells in the bounding box of each triangle.
     low = np.clip(np.ceil(corners.min(axis=1)), 0, shape).astype(int)
     high = np.clip(np.floor(corners.max(axis=1)), -1, shape - 1).astype(int)
     sides = np.maximum(high - low + 1, 0)
@@ -163,7 +165,7 @@ def _receivers(φ: Field, aspect: float) -> tuple[Field, Field]:
     y, x = cells[inside].T
     found[y, x] = np.einsum("ni,nij->nj", weights[inside], ends[triangles[owner[inside]]])
     missing = np.isnan(found[..., 0])
-    if missing.any():  # rounding errors beside a triangle without area
+    if missing.any():  # rounding errors can leave cells outside of all triangles, next to a triangle of zero area
         y, x = scipy.ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
         found = found[y, x]
     return found[..., 0], found[..., 1]
@@ -178,7 +180,10 @@ def _at(field: Field, rows: Field, columns: Field) -> Field:
 
 
 def _divergence(slope_x: Field, slope_y: Field) -> Field:
-    """Return the divergence of slopes at the cells, none of which leave the border: the normal equations."""
+    """Return the divergence of slopes at the cells, with zero flux through the border.
+
+    This is the right-hand side of the normal equations of step 3.
+    """
     result = np.zeros_like(slope_x)
     for axis, slope in enumerate((slope_y, slope_x)):
         flow, into = np.moveaxis(slope, axis, 0), np.moveaxis(result, axis, 0)

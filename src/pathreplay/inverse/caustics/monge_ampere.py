@@ -4,8 +4,8 @@ The map S = ∇v with a convex potential v transports the density g to the unifo
 
     det D²v = g,        v(y) = |y|²/2 + φ(y),
 
-and maps the rectangle to itself, so that the normal derivative of φ vanishes on its border. All second derivatives are
-finite differences of the cells, so that each pixel of g has an equation of its own. A Newton step solves the linear
+It also maps the rectangle to itself, so the normal derivative of φ vanishes on the border. Second derivatives are
+finite differences between cells, which gives one equation per pixel of g. A Newton step δ of φ solves the linear
 elliptic equation
 
     cof(D²v) : D²δ = det D²v (log g - log det D²v)
@@ -29,7 +29,8 @@ _MOST_STEPS = 60
 _ACCURACY = 1e-3
 """Root mean square of g - det D²v at the solution, relative to the mean of g."""
 _LINEAR_ACCURACY, _MOST_LINEAR_STEPS = 1e-3, 100
-"""Relative residual of Newton steps. At 1e-2, dark pixels beside bright ones often stop Newton's method."""
+"""Relative residual at which the linear solver stops, and its maximum number of iterations. With a residual of 1e-2,
+Newton's method often fails where dark pixels are next to bright pixels."""
 _SHRINKAGE, _SHORTEST = 0.6, 1e-4
 """Factor by which a step is shortened until v is convex, and the shortest step relative to Newton's."""
 _LEAST_DETERMINANT = 0.1
@@ -42,7 +43,7 @@ def potential(density: Field, initial: Field | None = None, width: float = 1.0) 
     Args:
         density: density g per cell, positive; its scale is arbitrary.
         initial: potential of a similar density, from which the iteration starts; default: zero.
-        width: width of a cell, where the height is 1.
+        width: width of a cell. Its height is 1.
 
     Returns:
         The potential φ per cell.
@@ -57,7 +58,7 @@ def potential(density: Field, initial: Field | None = None, width: float = 1.0) 
         a, b, c = hessian(φ, width)
         a, b = 1 + a, 1 + b
         determinant = a * b - c * c
-        # The differences do not conserve the integral of the determinant exactly.
+        # The integral of the discretised determinant is not exactly constant, so g is scaled to it.
         wanted = g * determinant.mean()
         if np.sqrt(np.mean(np.square(wanted - determinant))) < _ACCURACY:
             return φ
@@ -81,7 +82,7 @@ def potential(density: Field, initial: Field | None = None, width: float = 1.0) 
 def hessian(φ: Field, width: float = 1.0) -> tuple[Field, Field, Field]:
     """Return the second differences ∂yy, ∂xx and ∂xy of a field that is mirrored at its border.
 
-    Cells have this width and the height 1.
+    Cells have the given width and the height 1.
     """
     p = np.pad(φ, 1, mode="edge")
     twice = 2 * φ
@@ -92,9 +93,9 @@ def hessian(φ: Field, width: float = 1.0) -> tuple[Field, Field, Field]:
 
 
 def poisson_solver(shape: tuple[int, ...], width: float = 1.0) -> Callable[[Field], Field]:
-    """Return a function that solves ∂yy u + ∂xx u = r - mean(r) for u of mean zero, mirrored at its border.
+    """Return a function that solves ∂yy u + ∂xx u = r - mean(r) for u. The mean of u is zero.
 
-    Cells have this width and the height 1.
+    The field u is mirrored at its border. Cells have the given width and the height 1.
     """
     y, x = (2 * np.cos(np.pi * np.arange(n) / n) - 2 for n in shape)
     eigenvalues = y[:, None] + x / width**2
@@ -146,5 +147,5 @@ def _bicgstab(apply: Callable[[Field], Field], r: Field, precondition: Callable[
 
 
 def _dot(a: Field, b: Field) -> float:
-    # Not a BLAS function: its threads wait for each other, which takes long on a busy machine.
+    # No BLAS function is used, because its threads wait for each other, which is slow on a busy machine.
     return float(np.sum(a * b))

@@ -18,8 +18,8 @@ class Optics:
     the plane z = 0, centred at the origin. The receiver is a parallel plane at positive z.
 
     Light reaches a slab along the z axis, and the receiver is centred on this axis. Light reaches a mirror along
-    (sin α, 0, -cos α), where α is the angle of the mirror. The receiver is centred where a flat mirror reflects the
-    light of its own centre.
+    (sin α, 0, -cos α), where α is the angle of the mirror. The centre of the receiver is the point to which a flat
+    mirror reflects the light that arrives at the centre of the mirror.
 
     Args:
         width: width of the height map, whose cells are square. The surface ends at the centres of the outer cells.
@@ -68,9 +68,10 @@ class Optics:
 
     @property
     def foreshortening(self) -> float:
-        """Factor by which the surface is shorter along x, seen along the light.
+        """Apparent width of the surface along x, seen from the light, relative to its width: cos α.
 
-        A mirror with small slopes shifts the light on the receiver by -2 (h_x / cos² α, h_y) times the distance.
+        Small slopes (h_x, h_y) of a mirror shift the light on the receiver by -2 (h_x / cos² α, h_y) times the
+        distance.
         """
         return float(np.cos(np.radians(self.mirror_angle or 0)))
 
@@ -101,7 +102,7 @@ class Optics:
         half vector. Neither has unit length.
 
         Raises:
-            PathreplayError: a ray would have to turn by more than refraction at the critical angle turns it.
+            PathreplayError: the required deflection of a ray exceeds the deflection at the critical angle.
         """
         if self.eta is None:
             return outgoing - incoming
@@ -117,8 +118,8 @@ class Optics:
     def _refracted(self, x: Field, y: Field, z: Field, eta: float, s: float) -> tuple[Field, Field]:
         """Return direction and flux of light from a point at the distance ``s`` from the entry surface of the slab."""
         depth, r = self.thickness + z, np.hypot(x, y)
-        # Newton's method for the sine of the angle in the slab: r = s tan θ + depth tan θ', sin θ = eta sin θ'. Both
-        # tangents are convex in q, so that the iteration converges from above.
+        # Newton's method for q = sin θ', where θ' is the angle to the axis in the slab and θ the angle outside:
+        # r = s tan θ + depth tan θ', sin θ = eta q. Both tangents are convex in q, so it converges from above.
         q = r / np.hypot(r, s) / eta
         for _ in range(20):
             outside, inside = np.sqrt(1 - np.square(eta * q)), np.sqrt(1 - np.square(q))

@@ -40,8 +40,8 @@ class Optimizer(Table):
     history_size: Count | None = None
     """Number of corrections that L-BFGS-B keeps."""
     tolerance: Positive | None = None
-    """Fraction of the initial loss; L-BFGS-B stops when a step lowers the loss by less than that, and
-    Levenberg-Marquardt when the noise of the values raises the loss by less than that (default: never)."""
+    """Stopping threshold as a fraction of the initial loss. L-BFGS-B stops when a step lowers the loss by less than
+    this. Levenberg-Marquardt stops when the noise of the values raises the loss by less than this (default: never)."""
     damping: Positive | None = None
     """Initial damping of Levenberg-Marquardt, relative to the diagonal of the Gauss-Newton matrix."""
 
@@ -59,12 +59,12 @@ class Optimizer(Table):
 
     @property
     def searches(self) -> bool:
-        """Whether the optimiser compares losses of different iterations, which use the same random numbers."""
+        """Whether the optimiser compares losses of different iterations. These use the same random numbers."""
         return self.type in ("l-bfgs-b", "levenberg-marquardt")
 
     @property
     def is_second_order(self) -> bool:
-        """Whether it needs the Gauss-Newton model of the loss."""
+        """Whether the optimiser needs the Gauss-Newton model of the loss."""
         return self.type == "levenberg-marquardt"
 
     def options(self) -> Json:

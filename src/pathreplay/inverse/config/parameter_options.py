@@ -17,7 +17,8 @@ class ImageValue(Table):
     image: str
     """Image file, or 'matplotlib:NAME' for a sample image of matplotlib."""
     fit: Literal["stretch", "crop"] = "stretch"
-    """'stretch' resamples the image to the shape of the texture. 'crop' first crops the image to this aspect ratio."""
+    """'stretch' resamples the image to the shape of the texture. 'crop' first crops the image to the aspect ratio of
+    the texture."""
     raw: Switch = False
     """Use the stored values without decoding them from sRGB."""
 
@@ -73,11 +74,12 @@ class TransportStart(Table):
     source_distance: Positive | None = None
     """Distance from a point light to the entry surface, or to the mirror; default: collimated light."""
     thickness: Annotated[Finite, Field(ge=0)] = 0.0
-    """Distance from the entry surface to the exit surface, which matters for a point light only."""
+    """Distance from the entry surface to the exit surface. It has an effect only for a point light."""
     floor: Annotated[Finite, Field(gt=0, lt=1)] = 0.02
     """Fraction of the light that is distributed evenly."""
     fit: Literal["stretch", "crop"] = "stretch"
-    """'stretch' resamples the image to the shape of the map. 'crop' first crops the image to this aspect ratio."""
+    """'stretch' resamples the image to the shape of the map. 'crop' first crops the image to the aspect ratio of the
+    map."""
     raw: Switch = False
     """Use the stored values without decoding them from sRGB."""
 
@@ -96,8 +98,8 @@ Initial = Annotated[
     | Annotated[TransportStart, Tag("TransportStart")],
     Discriminator(_kind_of_initial),
 ]
-"""Initial value of a parameter; for a pose, its initial displacement relative to the scene; for a height map, the image
-of its caustic."""
+"""Initial value of a parameter. For a pose, this is its displacement relative to the scene. For a height map, it may be
+the image of its caustic."""
 
 
 NOT_OF_A_POSE = frozenset(
@@ -148,7 +150,7 @@ class Parameter(Table):
     regularizer: ImportPath | None = None
     """Function of the values that is added to the loss, as module:function."""
     shape: Annotated[list[Count], Field(min_length=1, max_length=8)] | None = None
-    """Shape of a parameter that is not part of the scene, and from which scene parameters are derived."""
+    """Shape of a parameter that is not part of the scene. Scene parameters are derived from it."""
 
     @property
     def displacement(self) -> Displacement:
@@ -222,12 +224,13 @@ class Displace(Table):
     direction: Literal["normal"] | Vector = "normal"
     """Direction of positive heights: the normal at each vertex of the mesh in the scene, or a vector."""
     coordinates: Literal["uv", "xy", "xz", "yx", "yz", "zx", "zy"] = "uv"
-    """Coordinates on the height maps: the texture coordinates, or two axes, along which they span the whole mesh."""
+    """Coordinates of a vertex on the height maps: its texture coordinates, or two axes of the scene. With two axes, the
+    maps cover the bounding box of the mesh."""
     interpolation: Literal["linear", "cubic"] = "linear"
     """Interpolation of the height maps: linear, or by cubic B-splines, whose slopes and curvatures are continuous."""
     weights: str | Annotated[list[str], Field(min_length=1)] | None = None
-    """Attribute of the mesh, such as 'vertex_weight', whose numbers multiply the heights; with several height maps, a
-    list of one attribute for each; default: 1 everywhere."""
+    """Attribute of the mesh that contains a factor on the heights per vertex, such as 'vertex_weight'. With several
+    height maps, a list of one attribute per map. Default: 1 everywhere."""
 
 
 class Derivation(Table):
@@ -252,7 +255,7 @@ class Derivation(Table):
             maps = len(weights) if isinstance(weights, list) else 1
             if len(self.of) != maps:
                 raise ValueError(
-                    f"derived '{self.key}': 'of' names {len(self.of)} height maps, but displace.weights {maps}; give a "
-                    "list in 'weights' that has one attribute for each map"
+                    f"derived '{self.key}': 'of' names {len(self.of)} height maps, but displace.weights names {maps} "
+                    "attributes; give a list in 'weights' that has one attribute for each map"
                 )
         return self

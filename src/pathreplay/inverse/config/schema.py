@@ -76,7 +76,7 @@ class Config(Table):
     loss: str = "l2"
     """Name of a loss, or module:function."""
     debias: Switch = False
-    """Evaluate a smooth loss at two halves of the samples, too, and remove the bias due to noise to first order."""
+    """Also evaluate a smooth loss at each half of the samples, and remove the bias due to noise to first order."""
     iterations: Count = 200
     """Number of iterations."""
     spp: Spp = 16

@@ -60,7 +60,8 @@ class Lens:
         """Distort points of the plane z = 1.
 
         Returns:
-            The distorted x' and y', and a mask of the points within the radius up to which the lens is monotonic.
+            The distorted x' and y', and a mask. The mask selects the points up to the radius at which the distorted
+            radius stops increasing.
         """
         r = np.hypot(x, y)
         radii = np.linspace(0, max(float(r.max(initial=0.0)), 1e-6), _STEPS)

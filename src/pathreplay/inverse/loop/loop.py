@@ -1,4 +1,4 @@
-"""The optimisation loop, which evaluates, steps and projects variables. Runs can be interrupted and resumed."""
+"""The optimisation loop: evaluate loss and gradient, step, and project. Runs can be interrupted and resumed."""
 
 from __future__ import annotations
 

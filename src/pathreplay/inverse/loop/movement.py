@@ -2,7 +2,7 @@
 
 The noise of gradients is independent between iterations. The standard error of the mean gradient over a window of n
 iterations is therefore the standard deviation of the gradients divided by √n. The expected gradient is zero at
-convergence and nonzero before. This holds for any step size, so small steps are not mistaken for
+convergence and nonzero before convergence. This holds for any step size, so small steps are not mistaken for
 convergence.
 
 A variable also counts as converged if its gradient is small relative to the initial gradient. Near a minimum, the loss

@@ -1,4 +1,4 @@
-"""What a second-order optimiser needs from an iteration: its choice of random numbers, and the Gauss-Newton model."""
+"""Second-order optimisers in the loop: their choice of random numbers, and the Gauss-Newton model of an iteration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathreplay.inverse.problem.problem import Problem
 
 
 def draw_of(optimiser: Optimiser, iteration: int, searches: bool) -> tuple[int, bool]:
-    """Return which random numbers an iteration uses, and whether its shards are of second order (see `Shard`).
+    """Return the index of the random numbers of an iteration, and whether its shards are of second order (see `Shard`).
 
     Args:
         optimiser: the optimiser.
@@ -27,7 +27,10 @@ def draw_of(optimiser: Optimiser, iteration: int, searches: bool) -> tuple[int, 
 
 
 def observe(problem: Problem, optimiser: Optimiser, values: Arrays, evaluation: Evaluation) -> None:
-    """Hand the model of an evaluation to a second-order optimiser, in its coordinates and with regularizers."""
+    """Pass the Gauss-Newton model of an evaluation to a second-order optimiser.
+
+    The model includes the regularizers. It is a function of the latent variables that the optimiser steps.
+    """
     model = evaluation.model
     if not isinstance(optimiser, LevenbergMarquardt) or model is None:
         return

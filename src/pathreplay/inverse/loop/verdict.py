@@ -71,7 +71,8 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     except (PathreplayError, RuntimeError, ValueError, np.linalg.LinAlgError):
         # User functions or Mitsuba may reject perturbed values. This is no error of the run, which has succeeded.
         return Verdict(moving, arrived)
-    # Variables with a nonzero gradient affect the images, even if a perturbation moves no silhouette across a sample.
+    # Variables with a nonzero gradient affect the images. The finite differences of `columns_of` may be zero
+    # nevertheless, if the perturbation moves no silhouette across a sample.
     pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
     return Verdict(moving, arrived, pairs, tuple(key for key in unseen if key not in pulled))
 

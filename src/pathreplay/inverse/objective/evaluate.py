@@ -59,9 +59,10 @@ class Shard:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Contribution of a shard to the loss (the mean over the training views) and to the gradients, indexed by key.
+    """Contribution of a shard to the loss, which is the mean over the training views, and to its gradients.
 
-    Gradients are unbiased for the losses in `QUADRATIC`. The expected loss includes the variance of the images.
+    Gradients are indexed by the key of the variable. They are unbiased for the losses in `QUADRATIC`. The expected loss
+    includes the variance of the images.
     """
 
     loss: float
@@ -196,14 +197,14 @@ class Evaluator:
         self._moving = frozenset((v.key for v in problem.variables) if moving is None else moving)
         self._reached = problem.reached(self._moving)
         has_media = facts_of(problem.scene).has_media
-        # Deterministic jobs do not record, since recorded kernels are split differently. This changes the last bit.
+        # Deterministic jobs do not record passes: recorded kernels are split differently, which changes the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(self.integrator, has_media) and problem.loss not in ELSEWHERE
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # Keys: samples per pixel.
         # Whether a pixel sweep is possible. Keys: view, samples per pixel, and whether pixels are batched.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
         self._learned: Arrays = {}  # State of the integrator after the last evaluation.
-        self._at: object = None  # Object that represents this state. Another evaluator may replace it.
+        self._at: object = None  # The integrator's object for this state, which another evaluator may have replaced.
         self._begun = False
         self._jacobians: Jacobians | None = None
 
@@ -269,7 +270,7 @@ class Evaluator:
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
-        # One bad path must not end a long run. A sum is finite if and only if all entries are, and needs no memory.
+        # One bad path must not end a long run. Only finite entries have a finite sum, which needs no temporary array.
         broken = [key for key, gradient in gradients.items() if not np.isfinite(gradient.sum(dtype=np.float64))]
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:
@@ -298,7 +299,7 @@ class Evaluator:
             if why and batch is not None:
                 raise refused(about.name, why)
             self._sweeps[which] = not why and view in self._reached
-        # Seeds are inputs of recorded passes. Traced passes use plain integers, which need not be read back.
+        # Seeds are inputs of recorded passes. Other passes take plain integers, which avoids reads from the device.
         number = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         request = RenderRequest(sensor, number, spp, batch)
         loss = ViewLoss(problem.loss, about.share / len(problem.trained()), self._sweeps[which], problem.debias)

@@ -218,9 +218,10 @@ def _extrapolated(
 ) -> tuple[mi.Float, mi.TensorXf]:
     """Return the loss of the mean image, extrapolated from the losses of independent ``images``; and the mean image.
 
-    The bias of a smooth loss f at an image of N samples is c / N + O(1 / N²). Let the images have the ``shares`` s_i of
-    the samples. In 2 f(Σ s_i I_i) - Σ s_i f(I_i), the terms c / N of two images cancel (jackknife). All images have the
-    same expectation, so the adjoint of this expectation is the sum of the adjoints of the images.
+    The bias of a smooth loss f at an image of N samples is c / N + O(1 / N²). Let the image I_i have the share s_i of
+    the N samples. The bias of f(I_i) is then c / (s_i N) to first order. For two images, the terms c / N therefore
+    cancel in 2 f(Σ s_i I_i) - Σ s_i f(I_i) (jackknife). All images have the same expectation, so the adjoint of this
+    expectation is the sum of the adjoints of the images.
     """
     if len(images) == 1:
         return target.compared(loss, images[0]), images[0]

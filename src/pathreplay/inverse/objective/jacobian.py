@@ -1,6 +1,7 @@
-"""Forward passes of a view: its image and the derivatives by every entry of the variables, in two independent halves.
+"""Image of a view and its derivatives with respect to every entry of the variables, from forward passes.
 
-Each entry takes one forward pass per half, with the random numbers of the image of that half.
+Image and derivatives are computed twice, from two independent halves of the samples. Each entry takes one forward pass
+per half. The pass uses the same random numbers as the image of this half.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from pathreplay.inverse.problem.problem import Problem, scene_values
 from pathreplay.platform import memory
 
 IMAGE = ""
-"""Stands for the image itself among the keys of the variables."""
+"""Key of the image itself. All other keys are keys of variables, and stand for derivatives."""
 
 
 class Jacobians:
-    """Differentiates the images of a problem by the variables ``moving``; the scene keeps the values.
+    """Differentiates the images of a problem with respect to the variables ``moving``. The scene keeps their values.
 
     Args:
         problem: the problem, with a quadratic loss.
@@ -37,7 +38,7 @@ class Jacobians:
     def __init__(self, problem: Problem, integrator: StatefulIntegrator, moving: Collection[str], record: bool) -> None:
         self.problem, self.integrator, self.freezes = problem, integrator, record
         self._recordings = Recordings()
-        self._traced: set[tuple[str, int]] = set()  # by variable, or IMAGE, and view
+        self._traced: set[tuple[str, int]] = set()  # pairs of a variable (or IMAGE) and a view
         self._moving = [v.key for v in problem.variables if v.key in moving]
         self._reached = {key: problem.reached(frozenset({key})) if key != EXPOSURE else set() for key in self._moving}
 
@@ -50,7 +51,7 @@ class Jacobians:
             values: values of all variables.
             view: index of the view.
             seed: seed of the view.
-            spp: samples per pixel, half of them for each image and each of its derivatives.
+            spp: samples per pixel of both halves together.
 
         Raises:
             NotRecordable: a plugin of the scene prevents Dr.Jit from recording a pass.
@@ -60,11 +61,12 @@ class Jacobians:
         sizes = {key: values[key].size for key in self._moving}
         memory.require(
             12 * sum(sizes.values()) * about.target.size,
-            f"The derivatives of view '{about.name}' by {sum(sizes.values())} entries",
+            f"The derivatives of view '{about.name}' with respect to {sum(sizes.values())} entries",
             "use fewer parameters or smaller films",
         )
         seeds = [int(s) for s in np.random.SeedSequence([seed]).generate_state(2)]
-        opaque = [dr.opaque(mi.UInt32, half) if self.freezes else half for half in seeds]  # see `Evaluator`
+        # Seeds are inputs of recorded passes, as in `Evaluator`.
+        opaque = [dr.opaque(mi.UInt32, half) if self.freezes else half for half in seeds]
         a, b = (self._half(values, view, RenderRequest(about.sensor, half, spp // 2)) for half in opaque)
         dropped = {}
         begin = 0
@@ -92,7 +94,7 @@ class Jacobians:
         }
 
     def _half(self, values: Arrays, view: int, request: RenderRequest) -> Half:
-        """Render the image of a view, and its derivatives by all entries."""
+        """Render the image of a view, and its derivatives with respect to all entries."""
         target = self.problem.views[view].target
         factor = factor_of(values, view, target.shape[2])
         variables = self.problem.cache.variables(self.problem, values)
@@ -128,7 +130,7 @@ class Jacobians:
         dr.forward_from(variables[key], dr.ADFlag.ClearEdges)
 
     def _pass(self, key: str, view: int, request: RenderRequest) -> Array:
-        """Render the tangent that a variable carries, or the image; from the second time on in a recorded pass."""
+        """Render the image, or its derivative along the tangent of a variable. Later calls use a recorded pass."""
         scene, integrator, run = self.problem.scene, self.integrator, _image if key == IMAGE else _tangent
         state = integrator.begin(scene)
         # The first call is not recorded: see `Evaluator`.

@@ -35,7 +35,7 @@ class Batch:
         count = n if among is None else len(among)
         numbers = np.random.default_rng([BATCH, seed]).choice(count, min(most, count), replace=False)
         chosen = np.sort(numbers if among is None else among[numbers]).astype(np.uint32)
-        pixels = mi.UInt32(chosen) + dr.opaque(mi.UInt32, 0)  # memory that Dr.Jit owns: see `variables_of`
+        pixels = mi.UInt32(chosen) + dr.opaque(mi.UInt32, 0)  # copy to memory that Dr.Jit owns, see `variables_of`
         dr.eval(pixels)
         return Batch(pixels, count / n)
 
@@ -50,7 +50,7 @@ def obstacle(problem: Problem, integrator: StatefulIntegrator, sensor: int, spp:
     ``some`` selects a pass over a batch of pixels instead of all pixels.
     """
     if problem.loss not in QUADRATIC:
-        return "its loss is none of l2 and relative-l2; take one of these"
+        return "its loss is neither l2 nor relative-l2; use one of these"
     return integrator.why_no_pixel_sweep(problem.scene, problem.scene.sensors()[sensor], spp, some)
 
 

@@ -39,8 +39,9 @@ def require_reached(problem: Problem) -> None:
         if not reached and EXPOSURE not in part.moving:  # an exposure scales every image
             names = _listed(view.name for view in views.values())
             raise PathreplayError(
-                f"{where}{_listed(sorted(part.problem.moves(part.moving)))} reaches none of the views that are learned "
-                f"from ({names}): it is a part of other cameras; name the views of these, or other parameters"
+                f"{where}{_listed(sorted(part.problem.moves(part.moving)))} affects none of the training views "
+                f"({names}), because it belongs to other cameras; add the views of these cameras, or name other "
+                "parameters"
             )
         if reached:
             _require_differentiated(part, views[reached[0]].sensor, where)

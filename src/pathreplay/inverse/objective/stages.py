@@ -75,9 +75,9 @@ def _views(problem: Problem, stage: Stage) -> set[str] | None:
     for item in stage.sensors:
         named = [v for v in problem.views if item in (v.name, ids[v.name]) or item == v.sensor]
         if not named or named[0].is_test:
-            why = "is a test view" if named else "is none of the job's views"
+            why = "is a test view" if named else "is not a view of the job"
             names = ", ".join(v.name for v in problem.trained().values())
-            raise PathreplayError(f"stages: sensor {shown(item)} {why}; name some of {names}")
+            raise PathreplayError(f"stages: sensor {shown(item)} {why}; name training views: {names}")
         found.add(named[0].name)
     return found
 
@@ -112,7 +112,9 @@ def require_stages(problem: Problem) -> None:
                 _integrator(plugin, stage.max_depth)
     for variable in problem.variables:
         if config.stages and not any(variable.key in _moving(problem, stage) for stage in config.stages):
-            raise PathreplayError(f"stages: '{variable.key}' moves in none of them; name it in one, or leave it out")
+            raise PathreplayError(
+                f"stages: no stage optimises '{variable.key}'; name it in a stage, or remove the parameter"
+            )
 
 
 def require_single_pixels(problem: Problem) -> None:
@@ -135,7 +137,7 @@ def _require_single_pixels(part: Part, integrator: mi.Integrator) -> None:
         camera = f"{problem.scene.sensors()[view.sensor].id()}."
         why = obstacle(problem, stateful(integrator), view.sensor, spp, some=True)
         if moves := sorted(key for key in problem.moves(part.moving) if key.startswith(camera)):
-            why = f"its camera moves; hold '{moves[0]}'"
+            why = f"its camera moves; freeze '{moves[0]}'"
         if why:
             raise refused(view.name, why)
 
@@ -145,12 +147,12 @@ def _require_divisible(sensor: mi.Sensor, name: str, downscale: int) -> None:
     width, height = (int(n) for n in film.size())
     if downscale > 1 and (tuple(film.crop_size()) != (width, height) or film.sample_border()):
         raise PathreplayError(
-            f"stages: the film of sensor '{name}' has a crop window or samples its border; leave 'downscale' out"
+            f"stages: the film of sensor '{name}' has a crop window or samples its border; remove 'downscale'"
         )
     if width % downscale or height % downscale:
         most = np.gcd(width, height)
         fit = [n for n in range(2, min(int(most), 64) + 1) if most % n == 0]
-        remedy = f"take one of {', '.join(map(str, fit))}" if fit else "leave it out"
+        remedy = f"use one of {', '.join(map(str, fit))}" if fit else "remove it"
         raise PathreplayError(
             f"stages: downscale = {downscale} does not divide the {width} x {height} pixels of sensor '{name}'; "
             f"{remedy}"
@@ -223,7 +225,7 @@ def evaluator_of(problem: Problem, integrator: mi.Integrator, plugin: Plugin) ->
     record = not config.deterministic
     if isinstance(problem, JointProblem):
         if config.stages is not None:
-            raise PathreplayError("stages: joint problems support none; leave them out")
+            raise PathreplayError("stages: joint problems do not support stages; remove them")
         return JointEvaluator(problem, [Evaluator(part, part.integrator, record) for part in problem.parts])
     if config.stages is None:
         return Evaluator(problem, integrator, record)

@@ -4,12 +4,14 @@
 (H + λ diag H) δ = -g within the bounds. It is rejected if the loss grows by more than the noise along the step,
 √(δᵀΣδ), with the covariance Σ of the gradient. λ falls after good steps and grows after rejected ones.
 
-*Averaging.* The noise of g displaces the minimum by H⁻¹Σ^½, which raises the loss by ν = ½ tr(H⁻¹Σ) on average. When a
-step promises less than a fraction of ν, or steps do not lower the loss beyond its noise, further evaluations use fresh
-random numbers. The k-th of them takes the step 2 δ / (k + 2) with the mean of all H. The values then are a mean
-of the minima of all evaluations in which later ones count more, and their error falls like 1/√k, 15 % above that of the
-plain mean, which would forget the result of a search only like 1/k. If the minimum is far away twice in succession, the
-search begins again.
+*Averaging.* The noise of g displaces the minimiser by a random vector with the covariance H⁻¹ΣH⁻¹. On average, this
+raises the loss by ν = ½ tr(H⁻¹Σ). The search ends when the predicted decrease of the loss is below a fraction of ν, or
+when steps do not lower the loss by more than its noise. From then on, each evaluation uses new random numbers, and H
+and Σ are weighted means over the evaluations. The k-th of these evaluations takes the step 2 δ / (k + 2).
+
+The values are then a weighted mean of the minimisers of these evaluations, with weights proportional to k. Their error
+decreases like 1/√k. It is 15 % larger than with equal weights, but the influence of the result of the search decreases
+like 1/k² instead of 1/k. If the predicted decrease is very large twice in succession, the search begins again.
 """
 
 from __future__ import annotations
@@ -28,31 +30,33 @@ from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Matrix
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 MOST = 200
-"""Largest number of entries; each takes two forward passes per view and iteration."""
+"""Largest number of entries. Each entry takes two forward passes per view and iteration."""
 CONVERGED, NEAR = 0.25, 4.0
-"""Multiples of ν: a step that promises less than the first ends the search, and so does one that promises less than the
-second and does not lower the loss beyond its noise."""
+"""Multiples of ν at which the search ends. Below `CONVERGED` ν, the predicted decrease of the loss suffices. Below
+`NEAR` ν, the last step must also have failed to lower the loss by more than its noise."""
 STALLED = 6
-"""Number of successive rejections, or of successive steps that change the loss by less than its noise, after which no
-step is expected to lower it."""
+"""Number of consecutive rejections, or of consecutive steps that change the loss by less than its noise, after which
+the search ends."""
 OUTLIER, FAR = 9.0, 25.0
-"""Multiples of ν: steps of averaging that promise more than the first are shortened, those above the second suggest
-that the minimum has not been found."""
+"""Multiples of ν during averaging. If the predicted decrease of the loss exceeds `OUTLIER` ν, the step is shortened. If
+it exceeds `FAR` ν twice in succession, the search begins again."""
 RESTARTS = 3
-"""Largest number of searches that begin again, in case that the noise is underestimated."""
+"""Maximum number of times that the search begins again. The limit matters if the noise is underestimated."""
 GOOD, POOR = 0.75, 0.25
 """Ratios of the actual to the predicted decrease of the loss, above which λ falls, and below which it grows."""
 FALL, RISE = 0.1, 2.0
 LEAST, MOST_DAMPING = 1e-9, 1e9
 FLAT = 1e-8
-"""Ratio of eigenvalues of H, relative to its diagonal, below which the loss counts as constant along an eigenvector."""
+"""Ratio of an eigenvalue of H, scaled to unit diagonal, to the largest eigenvalue. Below this ratio, the loss counts as
+constant along the eigenvector."""
 LARGEST = 4.0
-"""Largest ratio of H to the robust matrix: noise lowers the latter less than that."""
+"""Upper limit of the eigenvalues of H relative to the robust matrix. Noise lowers the robust matrix by less than this
+factor, so larger eigenvalues are due to outliers."""
 SIGNAL = 1e-3
-"""Ratio of the robust matrix to the bias below which an entry does not move."""
+"""Ratio of the diagonals of the robust matrix and the bias (see `GaussNewton`), below which an entry does not move."""
 EFFECT = 10.0
-"""Largest predicted effect of a step on the mean image, relative to the loss: a Gauss-Newton step has at most 1, unless
-it follows an outlier of the gradient."""
+"""Upper limit of ½ δᵀ(R + B)δ relative to the loss, with the robust matrix R and the bias B: the squared change of the
+mean image that a step δ predicts. For Gauss-Newton steps, it exceeds 1 only due to outliers of the gradient."""
 ROUNDING = 1e-6
 """Relative error of losses in single precision."""
 
@@ -106,7 +110,7 @@ class LevenbergMarquardt:
     def _reset(self) -> None:
         self.finished = ""
         self.draw = 0
-        """Which random numbers the next evaluation uses: equal numbers in the search, new ones afterwards."""
+        """Index of the random numbers of the next evaluation. It is constant in a search, and increases afterwards."""
         self._steps = 0
         self._base: Point | None = None
         self._next = np.zeros(self._n)
@@ -150,7 +154,7 @@ class LevenbergMarquardt:
             self._begin_averaging(base.at + step, LEAST)
         elif (promise <= NEAR * usual and not lowered) or self._stalls == STALLED:
             self._begin_averaging(base.at, LEAST)
-        elif self._rejections == STALLED:  # the model is not to be trusted without damping
+        elif self._rejections == STALLED:  # the model is unreliable without damping
             self._begin_averaging(base.at, self._damping)
         else:
             step, self._predicted = self._solved(base, self._damping)
@@ -183,7 +187,7 @@ class LevenbergMarquardt:
         assert self._base is not None
         share = 2 / (self._count + 2)
         model = self._base.model.times(1 - share) + seen.model.times(share)
-        # Of covariances the mean is wanted, not that of the mean.
+        # This is the mean of the covariances. `times` would give the covariance of the mean gradient.
         noise = self._base.model.noise * (1 - share) + seen.model.noise * share
         point = replace(seen, model=replace(model, noise=noise))
         step, promise = self._solved(point, self._damping)
@@ -212,7 +216,7 @@ class LevenbergMarquardt:
     def _solved(self, point: Point, damping: float) -> tuple[Matrix, float]:
         """Return the step within the bounds, and the decrease of the loss that the model predicts.
 
-        Entries that reach a bound are held there, and the others are solved for again.
+        Entries that cross a bound are set to the bound, and the linear system is solved again for the other entries.
         """
         model = _positive(point.model)
         damped = model + damping * np.diag(_scale(point.model))
@@ -236,9 +240,9 @@ class LevenbergMarquardt:
         return step, float(-point.gradient @ step - 0.5 * step @ model @ step)
 
     def _excess(self, model: GaussNewton) -> float:
-        """Return ν, by which the noise of one evaluation raises the loss at the minimum on average.
+        """Return ν, the mean increase of the loss at the minimiser due to the noise of one evaluation.
 
-        Directions in which the loss hardly changes do not count, such as the common scale of exposures.
+        Directions in which the loss hardly changes, such as the common scale of exposures, do not contribute.
         """
         scale = _scale(model)
         free = scale > 0
@@ -254,7 +258,7 @@ class LevenbergMarquardt:
         }
 
     def answer(self) -> dict[str, Array]:
-        """Return the last accepted point of a search; empty before the first step and while averaging."""
+        """Return the last accepted point of a search; an empty dictionary before the first step and while averaging."""
         if self._base is None or (self._count and not self.finished):
             return {}
         return self._split(self._next if self._count else self._base.at)
@@ -307,9 +311,10 @@ class LevenbergMarquardt:
 
 
 def _positive(model: GaussNewton) -> Matrix:
-    """Return H, raised where it is within its own noise, as far as its diagonal tells, and lowered at outliers.
+    """Return H with its eigenvalues relative to the robust matrix clipped to an interval.
 
-    Both are relative to the robust matrix.
+    The lower limit is the relative noise of H, estimated from its diagonal. The upper limit is `LARGEST`, which bounds
+    the effect of outliers.
     """
     scale = _scale(model)
     used = scale > 0
@@ -323,6 +328,6 @@ def _positive(model: GaussNewton) -> Matrix:
 
 
 def _scale(model: GaussNewton) -> Matrix:
-    """Return the diagonal of the robust matrix, or zero for entries whose derivative is nothing but noise."""
+    """Return the diagonal of the robust matrix, with zeros for entries whose derivatives are mere noise."""
     diagonal, noise = np.diag(model.robust), np.diag(model.bias)
     return np.where(diagonal > SIGNAL * noise, diagonal, 0)

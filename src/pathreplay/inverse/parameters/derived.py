@@ -3,8 +3,8 @@
     p = f(p₀, a, b, ...),      where p₀ is the value in the scene and a, b, ... are variables
 
 Examples are a mesh whose bending depends on two numbers, one colour for three materials, a camera on a turntable, or
-a texture that a neural network predicts. The function is written in Dr.Jit, and derivatives propagate through it. It
-belongs to the user, or is the built-in displacement of a mesh by height maps (`displace`).
+a texture that a neural network predicts. The function f is written in Dr.Jit, and derivatives propagate through it. It
+is a function of the user, or the built-in displacement of a mesh by height maps (`displace`).
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def _function(
 ) -> Imported:
     """Return the function of a derived parameter: one of the user's, or a displacement."""
     if entry.displace is None:
-        assert entry.function is not None  # see `Derivation`
+        assert entry.function is not None  # `Derivation` requires a function or a displacement
         return modules.function("Derivation", entry.function, "values")
     for argument in arguments:
         require_map(key, argument.key, argument.start.shape)

@@ -1,7 +1,7 @@
 """Displacement of a mesh by height maps, a built-in derived parameter.
 
     p = p₀ + Σ w_k h_k(u, v) d,    where p₀ is the position of a vertex in the scene, (u, v) are its coordinates on the
-                                   maps h_k, d is a unit vector and w_k the factor of a map
+                                   maps h_k, d is a unit vector, and w_k is the factor of the vertex for map k
 
 The position is linear in the entries of the maps, so its derivative is exact. Mitsuba recomputes vertex normals from
 positions whenever they are set, and derivatives propagate through this computation.
@@ -36,7 +36,7 @@ class HeightMap:
     merged: mi.UInt32 | None
     """Index of the position of each vertex, or None if all positions differ."""
     share: mi.Float
-    """One divided by the number of vertices with the position of each vertex."""
+    """1 / n for each vertex, where n is the number of vertices at the same position."""
     cubic: bool
 
     def __call__(self, first: mi.Float, heights: mi.TensorXf) -> mi.Float:
@@ -69,7 +69,7 @@ class HeightMaps:
     maps: tuple[HeightMap, ...]
 
     def __call__(self, first: mi.Float, *heights: mi.TensorXf) -> mi.Float:
-        """Compute the displaced positions from the positions p₀ and as many height maps as `maps` has (`HeightMap`)."""
+        """Compute the displaced positions from the positions p₀ and one height map per entry of ``maps``."""
         for place, grid in zip(self.maps, heights, strict=True):
             first = place(first, grid)
         return first

@@ -108,7 +108,7 @@ def gradient(values: Arrays, view: int, by_log: Array) -> Array:
 
 
 def derivatives_by_factors(values: Arrays, view: int, picture: Image) -> Array:
-    """Return the derivatives of the exposed image of a view by all entries of the variable, one image per entry."""
+    """Return the derivative of the exposed image of a view with respect to each entry of the variable."""
     rows = values[EXPOSURE]
     found = np.zeros((*rows.shape, *picture.shape), np.float32)
     colours = picture.shape[2] - (picture.shape[2] in (2, 4))

@@ -1,12 +1,13 @@
-"""The Gauss-Newton model of a loss that sums weighted squares: its matrix, and the noise of matrix and gradient.
+"""Gauss-Newton model of a weighted least-squares loss: the Gauss-Newton matrix, and the noise of matrix and gradient.
 
 With residuals r = I - T, weights W and the Jacobian J = ∂I/∂v, the loss is ½ rᵀWr, its gradient g = JᵀWr and the
 Gauss-Newton matrix H = JᵀWJ. Two halves a and b of the samples estimate all three without bias:
 
     ½ r_aᵀ W r_b,      g = ½ (J_aᵀ W r_b + J_bᵀ W r_a),      H = ½ (J_aᵀ W J_b + J_bᵀ W J_a).
 
-Within one half, the products would contain the variance of I, the covariance of J and I, and the variance of J. These
-cancel in differences: the covariance of ½ (J_aᵀ W r_a - J_bᵀ W r_b) is that of g, up to products of noise with noise.
+Products within one half would be biased by the variance of I, the covariance of J and I, and the variance of J,
+respectively. This bias cancels in the difference of the halves. The covariance of ½ (J_aᵀ W r_a - J_bᵀ W r_b) therefore
+equals the covariance of g, up to terms of second order in the noise.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from pathreplay.inverse.parameters.values import Array
 
 Matrix = NDArray[np.float64]
 TILE = 4
-"""Width of the square tiles of pixels whose noise counts as independent: wider than the usual filters."""
+"""Width of square tiles of pixels. The noise of different tiles counts as independent, because tiles are wider than the
+usual reconstruction filters."""
 DIFFERENCE = 1e-2
-"""Step of the numerical derivative of a regularizer's gradient, relative to the value, and the smallest value."""
+"""Step of finite differences, relative to the magnitude of an entry or to this number, whichever is larger."""
 _AT_ONCE = 2**22
 """Number of derivatives that are converted to double precision at once."""
 
@@ -36,26 +38,26 @@ class Half:
     residual: Image
     """Image minus target, height x width x channels."""
     jacobian: Array
-    """Derivative of the image by each of n entries, n x height x width x channels."""
+    """Derivative of the image with respect to each of n entries, n x height x width x channels."""
 
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """The model of a loss in all entries of its variables. Sums of losses have the sum of their models."""
+    """Model of a loss as a function of all entries of its variables. The model of a sum is the sum of the models."""
 
     sizes: dict[str, int]
-    """Number of entries of each variable, in their order."""
+    """Number of entries of each variable, in the order of the matrices."""
     matrix: Matrix
     """H, symmetric; unbiased, and therefore not always positive semidefinite."""
     robust: Matrix
-    """Like H, from what both halves agree on: the smaller derivative of a pixel, or zero if the signs differ. Positive
-    semidefinite; outliers of one half have no effect, but the noise of both adds to it."""
+    """JᵀWJ, where each entry of J is the entry of J_a or J_b with the smaller magnitude, or zero if their signs differ.
+    It is positive semidefinite. Outliers of one half have no effect on it, but noise of both halves raises it."""
     bias: Matrix
-    """What the noise of J would add to H if both factors came from the mean of the halves; positive semidefinite."""
+    """Bias of JᵀWJ due to noise, if J were the mean of both halves; positive semidefinite."""
     noise: Matrix
     """Covariance of the gradient."""
     spread: Matrix
-    """Variance of the diagonal of H, as far as the noise of J alone causes it; outliers dominate it."""
+    """Variance of the diagonal of H that is due to the noise of J alone. Outliers dominate it."""
     excess: float
     """Expected contribution of the noise of I to the loss of the mean image."""
 
@@ -77,7 +79,7 @@ class GaussNewton:
         )
 
     def within(self, sizes: Mapping[str, int]) -> GaussNewton:
-        """Return the model in more variables, on which the loss does not depend."""
+        """Return the model with additional variables, on which the loss does not depend."""
         ends = dict(zip(sizes, np.cumsum(list(sizes.values())), strict=True))
         at = np.concatenate([np.arange(ends[key] - n, ends[key]) for key, n in self.sizes.items()])
         n = sum(sizes.values())
@@ -167,7 +169,7 @@ def _tiles(images: Matrix) -> Matrix:
 
 
 def curvature(penalty: Callable[[Array], tuple[float, Array]], value: Array) -> Matrix:
-    """Differentiate the gradient of a regularizer numerically, once per entry; negative curvature counts as zero.
+    """Compute the Hessian of a regularizer by finite differences of its gradient. Negative eigenvalues are set to 0.
 
     Args:
         penalty: value and gradient of the regularizer as a function of the variable.

@@ -53,7 +53,7 @@ class Surface:
         return self._spread(self._solver.solve(points))
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """Convert the gradient with respect to v to u. The gradients of merged vertices are added."""
+        """Convert the gradient with respect to v to the gradient with respect to u, and add it over merged vertices."""
         total = np.zeros((self._matrix.shape[0], 3))
         np.add.at(total, self._copies, by_values.reshape(-1, 3))
         return self._spread(self._solver.solve(total))

@@ -81,7 +81,7 @@ def make_heights(key: str, shape: tuple[int, ...], value: TransportStart, base: 
 
     Raises:
         PathreplayError: the parameter is not a height map, the image is missing, unreadable or not finite, or no
-            surface refracts the light to it.
+            surface can direct the light to the image.
     """
     if len(shape) != 3 or shape[2] != 1 or min(shape[:2]) < 2:
         raise PathreplayError(

@@ -157,7 +157,7 @@ def make_variables(
     poses: list[Pose] = []
     for key, entry in keys.items():
         rate = entry.learning_rate
-        assert rate is not None  # see `Config.completed_entry`
+        assert rate is not None  # `Config.completed_entry` fills in a missing rate
         bounded = parameter_limits.require_learning_rate if limit_rates else lambda *_: None
         if entry.pose is None:
             form = AS_STORED if entry.shape else form_of(params, key)
@@ -174,7 +174,7 @@ def make_variables(
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
             if dr.is_tensor_v(like):
-                like = dr.zeros(type(like), start.shape)  # a literal, which takes no memory
+                like = dr.zeros(type(like), start.shape)  # literal zeros, which take no memory
             penalty = _penalty(params, key, entry, start, levels, modules)
             variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
             continue

@@ -66,9 +66,9 @@ def _differences(ours: Limits | None, theirs: Limits | None, config: Config) -> 
         return ()
     target = config.target.integrator
     assert target is not None
-    said = ", ".join(f"{name} = {getattr(theirs, name)} instead of {getattr(ours, name)}" for name in others)
+    said, own = (", ".join(f"{name} = {getattr(limits, name)}" for name in others) for limits in (theirs, ours))
     why = " and ".join(SHOWN[name] for name in others)
     return (
-        f"targets are rendered by '{target.type}' with {said} of the job's '{config.integrator.type}', which sets "
-        f"{why}; this biases the recovered values: remove [target] integrator, or set both alike",
+        f"targets are rendered by '{target.type}' with {said}, but the job's '{config.integrator.type}' has {own}; the "
+        f"images differ in {why}, which biases the recovered values: remove [target] integrator, or set both alike",
     )

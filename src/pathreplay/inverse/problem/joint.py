@@ -61,7 +61,7 @@ def joined(parts: Sequence[Problem], config: Config) -> JointProblem:
                     "only parameters of one shape are shared"
                 )
     if EXPOSURE in variables or any(part.baseline is not None for part in parts):
-        raise PathreplayError("Joint problems support neither 'exposure' nor 'baseline'; leave them out")
+        raise PathreplayError("Joint problems support neither 'exposure' nor 'baseline'; remove them")
     if len({id(part.scene) for part in parts}) < len(parts):
         raise PathreplayError("Two of the problems have the same scene; use one problem with several views")
     views = [replace(view, name=f"{n}-{view.name}") for n, part in enumerate(parts) for view in part.views]

@@ -75,7 +75,7 @@ class VariableCache:
         if any(key not in self._known or self._known[key][0]() is not values[key] for key in keys):
             self._known = {}  # release the old copies first
             converted = variables_of(problem, values)
-            # Weak references do not keep arrays alive. Ids would not do, because ids of freed arrays may be reused.
+            # Weak references do not keep arrays alive. Ids are not sufficient, because ids of freed arrays are reused.
             self._known = {key: (weakref.ref(values[key]), value) for key, value in converted.items()}
         variables = {key: self._known[key][1] for key in keys}
         dr.disable_grad(variables)
@@ -94,7 +94,7 @@ class Problem:
     baseline: mi.Integrator | None
     """Integrator of a second run, which solves the same problem in the same time for comparison; None without it."""
     judge: mi.Integrator
-    """Integrator of the images in which the results of ``integrator`` and ``baseline`` are compared with the targets.
+    """Integrator that renders images for comparing the results of ``integrator`` and ``baseline`` with the targets.
 
     This is the integrator that rendered the targets, or ``integrator`` if the targets are image files."""
     variables: tuple[Variable, ...]

@@ -70,7 +70,7 @@ def _pictures(run: Path, view: str | None) -> list[PIL.Image.Image]:
     if not views:
         raise PathreplayError(f"Run {run} has no frames in {FOLDER}; run the job with preview.share above 0")
     if view is not None and view not in views:
-        raise PathreplayError(f"Run {run} has no frames of view '{view}', but of {', '.join(views)}; name one of them")
+        raise PathreplayError(f"Run {run} has no frames of view '{view}'; name a view with frames: {', '.join(views)}")
     chosen = view or views[0]
     beside = [what for what in by_what if not what.startswith("view-")][:MOST_BESIDE]
     target = _opened(run / FOLDER / f"target-{chosen}.png")
