@@ -44,25 +44,34 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not list(broken_links(page))
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if scripts(name)])
+#: Pages with optimisations of a few seconds.
+LONG = {"start/ten-minutes.md", "do/lights.md", "do/materials.md"}
+SCRIPTS = [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in NAMES if scripts(n)]
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
 def test_scripts_of_a_page_run(name: str) -> None:
     names: dict[str, Any] = {}
     for block in scripts(name):
         run(block.code, names)
 
 
-JOBS = [(name, k) for name in NAMES for k in range(len(jobs(TEXTS[name])))]
+JOBS = {f"{name}-{k}": job for name in NAMES for k, job in enumerate(jobs(TEXTS[name]))}
 
 
-@pytest.mark.parametrize(("name", "k"), JOBS, ids=[f"{name}-{k}" for name, k in JOBS])
-def test_jobs_of_a_page_run(name: str, k: int) -> None:
-    """With few samples and iterations; jobs with files of the reader are only validated."""
-    job = jobs(TEXTS[name])[k]
-    config = make_config(quick(job))
-    if Path(job["scene"]).suffix or job.get("executor") == "ray":
-        return
-    result = optimize(config, output="run", progress=False)
-    assert np.isfinite([entry["loss"] for entry in result.history]).all()
+def test_jobs_of_the_pages_are_valid() -> None:
+    assert len(JOBS) > 8
+    for name, job in JOBS.items():
+        assert make_config(job).scene == job["scene"], name
+        make_config(quick(job))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, job in JOBS.items() if not Path(job["scene"]).suffix])
+def test_jobs_of_the_pages_run(name: str) -> None:
+    """With few samples and iterations, in one process."""
+    result = optimize(make_config({**quick(JOBS[name]), "executor": "local"}), output="run", progress=False)
+    assert np.isfinite([entry.loss for entry in result.history]).all()
 
 
 QUOTES = [(name, block) for name in NAMES for block in blocks(TEXTS[name]) if block.quoted is not None]

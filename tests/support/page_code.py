@@ -77,6 +77,7 @@ def quick(job: Mapping[str, Any]) -> dict[str, Any]:
     if "stages" in job:
         small["stages"] = [{**stage, "iterations": 1} for stage in job["stages"]]
         del small["iterations"]
+    small.pop("warmup_steps", None)
     spp = job.get("spp", 16)
     small |= {"spp": spp if spp == "auto" else min(spp, 2), "eval_spp": 2}
     if "images" not in job.get("target", {}) and "capture" not in job:
