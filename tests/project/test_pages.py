@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import typer.main
 
-from page_code import Block, blocks, broken_links, jobs, missing_lines, quick
+from page_code import Block, blocks, broken_links, jobs, missing_parts, quick
 from pathreplay import cli
 from pathreplay.jobs import make_config, optimize
 from places import ROOT
@@ -80,12 +80,12 @@ QUOTES = [(name, block) for name in NAMES for block in blocks(TEXTS[name]) if bl
 @pytest.mark.parametrize(("name", "block"), QUOTES, ids=[f"{name}: {block.mark}" for name, block in QUOTES])
 def test_quoted_lines_stand_in_the_source(name: str, block: Block) -> None:
     assert block.quoted is not None and block.quoted.is_file() and block.code.strip()
-    assert not missing_lines(block)
+    assert not missing_parts(block)
 
 
-def test_a_quotation_with_another_line_is_found() -> None:
-    block = Block("python", "quote src/pathreplay/errors.py", "class PathreplayError(Exception):\n    no such line\n")
-    assert "no such line" in missing_lines(block)
+@pytest.mark.parametrize("code", ["no such line\n", "import re\nclass PathreplayError(Exception):\n"])
+def test_a_quotation_that_differs_is_found(code: str) -> None:
+    assert missing_parts(Block("python", "quote src/pathreplay/errors.py", code)) == [code]
 
 
 DIFFS = [(name, k) for name in NAMES for k, block in enumerate(blocks(TEXTS[name], "diff")) if "import" in block.code]

@@ -46,12 +46,19 @@ def blocks(text: str, language: str | None = None) -> list[Block]:
     return [block for block in found if language in (None, block.language)]
 
 
-def missing_lines(block: Block) -> list[str]:
-    """Return the lines of a quotation that its file lacks; lines of an ellipsis are left out."""
+def missing_parts(block: Block) -> list[str]:
+    """Return the parts of a quotation that do not stand in its file; `...` on a line by itself separates parts.
+
+    The lines of a part have to follow each other. Blank lines and indentation do not count.
+    """
     assert block.quoted is not None
-    source = {line.strip() for line in block.quoted.read_text(encoding="utf-8").splitlines()}
-    quoted = [line.strip() for line in block.code.splitlines()]
-    return [line for line in quoted if line and line not in source and line not in ("...", "# ...")]
+    source = _lines(block.quoted.read_text(encoding="utf-8"))
+    parts = re.split(r"^ *\.\.\.$\n", block.code, flags=re.M)
+    return [part for part in parts if f"\n{_lines(part)}\n" not in f"\n{source}\n"]
+
+
+def _lines(code: str) -> str:
+    return "\n".join(line.strip() for line in code.splitlines() if line.strip())
 
 
 def jobs(text: str) -> list[dict[str, Any]]:
