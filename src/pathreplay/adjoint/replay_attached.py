@@ -36,9 +36,8 @@ def replay_attached(
     """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start`` of a ``path``.
 
     ``lost`` counts the paths on which an adjoint q was not finite and was set to zero. The recovery is exact on chains
-    of delta lobes. At smooth lobes, A_i has rank two, and q can be recovered only with noise. The result is then
-    unbiased, unless rounding errors, which the inverse amplifies, exceed the noise. Not differentiated: visibility and
-    weights that are exactly zero.
+    of delta lobes. At smooth lobes, A_i has rank two, and q can be recovered only with noise. The result is unbiased
+    unless rounding errors, amplified by the inverse, exceed the noise. Not differentiated: visibility and zero weights.
     """
     scale = length_scale(trace.scene)
     again = start.sampler.clone()
