@@ -12,6 +12,7 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.executor_options import ExecutorName
 from pathreplay.inverse.config.schema import Config, load_config
 from pathreplay.jobs.session import Optimization
+from pathreplay.platform.threads import one_thread
 from pathreplay.report.result import RunResult
 from pathreplay.runs.run_folder import Job, RunFolder, new_output, open_run_folder
 
@@ -51,9 +52,12 @@ def optimize(
         with iterate(
             config, resume=resume, output=output, progress=progress, define=define, executor=executor
         ) as session:
-            for _ in session:
-                pass
-            return session.stop()
+            # One change of the thread pool instead of one per iteration: when Dr.Jit 1.5 removes a thread at the moment
+            # at which the thread goes to sleep, it misses the wake-up call and the process waits forever.
+            with one_thread(session.deterministic):
+                for _ in session:
+                    pass
+                return session.stop()
     finally:
         # Free the scene, which is part of a reference cycle: Dr.Jit traces virtual calls through every scene in memory.
         gc.collect()

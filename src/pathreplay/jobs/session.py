@@ -38,6 +38,7 @@ class Optimization:
         self._stop = Stop()
         self._iterations = _iterations(job, output, Path.cwd(), resumed, progress, self._stop)
         self._resumed = resumed
+        self.deterministic = job.config.deterministic
         self.result: RunResult | None = None
 
     def __iter__(self) -> Iterator[Iteration]:
