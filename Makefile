@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DOCS_READY := $(VENV)/.docs-ready
 # Tracing keeps one core busy, and so two processes keep two; a file stays in one of them, with what its tests share.
 PYTEST := -q --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
@@ -15,7 +16,7 @@ VERSION_TESTS := tests/project/test_cli.py tests/inverse/config tests/inverse/da
   tests/transport/test_step.py tests/adjoint/test_lights.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-hours test-lowest test-newest always coverage lint bench release clean
+.PHONY: help demo test test-all test-hours test-lowest test-newest always coverage lint bench docs release clean
 
 help:
 	@echo "make demo      recover a texture, two wall colours and a light from rendered pictures, write a report"
@@ -27,6 +28,7 @@ help:
 	@echo "make coverage  lines of the package that the quick tests run"
 	@echo "make lint      ruff and mypy"
 	@echo "make bench     time, memory and variance next to Mitsuba's own integrators"
+	@echo "make docs      build the documentation site, build/site; NOTEBOOKS=off leaves out what notebooks print"
 	@echo "make release   build wheel and source archive, and run the demo from the wheel in an empty environment"
 	@echo "make clean     remove .venv and caches, keep runs/"
 	@echo "Another Python: make demo PYTHON=python3.12"
@@ -48,6 +50,10 @@ $(READY): pyproject.toml constraints.txt
 	@echo "make: setting up $(VENV) (once; about a minute)"
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+$(DOCS_READY): $(READY)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,docs]'
 	@touch $@
 
 demo: $(READY)
@@ -88,6 +94,12 @@ coverage: $(READY)
 # TASKS='surface --quick' and the like: see benchmarks/__main__.py; without it all of them, in full.
 bench: $(READY)
 	$(BIN)/python -m benchmarks $(TASKS)
+
+# Sphinx writes the site, and warnings are errors. Notebooks run if they have changed: NOTEBOOKS=off does not run them.
+NOTEBOOKS ?= cache
+docs: $(DOCS_READY)
+	PATHREPLAY_DOCS_NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -q -W --keep-going -c docs -d build/doctrees . build/site
+	@echo "build/site/index.html is the site"
 
 # Builds and tries the wheel in environments of its own.
 release: $(READY)
