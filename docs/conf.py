@@ -25,8 +25,9 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "mathml"]
 root_doc = "docs/index"
 include_patterns = ["docs/**.md", "examples/*/README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"]
 exclude_patterns = [".*", "build", "dist", "runs", "src", "tests", "benchmarks", "stubs", "**/__pycache__"]
-# Sections list the pages of a folder. A pattern without pages is no error; Sphinx gives this warning no type to suppress.
-logging.getLogger("sphinx.sphinx.directives.other").addFilter(lambda record: vars(record).get("subtype") != "empty_glob")
+# Sections list the pages of a folder, which may be empty. Sphinx gives this warning no type by which to suppress it.
+TOCTREES = logging.getLogger("sphinx.sphinx.directives.other")
+TOCTREES.addFilter(lambda record: vars(record).get("subtype") != "empty_glob")
 
 # Markdown is that of a code host: headings have its anchors, and formulas are between dollars.
 myst_heading_anchors = 4

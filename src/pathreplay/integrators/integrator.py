@@ -17,6 +17,7 @@ from pathreplay.adjoint.baseline import Baseline, BaselineState
 from pathreplay.adjoint.ray_jacobian import Recovery
 from pathreplay.adjoint.record import MAX_DEPTH
 from pathreplay.errors import PathreplayError
+from pathreplay.integrators import properties as declared
 from pathreplay.integrators.boundary_term import Boundary
 from pathreplay.integrators.camera_pass import Pass, Seed, Which
 from pathreplay.integrators.diagnostics import (
@@ -42,7 +43,6 @@ from pathreplay.integrators.term import Term, TermResult
 from pathreplay.transport.vertex import TraceConfig
 from pathreplay.types import Json
 
-ADJOINTS = ("auto", "recorded", "replay")
 #: Old property names of 0.1.0 and their current names.
 RENAMED = {
     "branch": "null_branching",
@@ -52,11 +52,6 @@ RENAMED = {
     "noise": "jacobian_noise",
     "numbers": "sampling",
 }
-ATTACH = ("delta", "all", "none")
-NULL_BRANCHING: tuple[str | bool, ...] = ("auto", True, False)
-SAMPLING = ("scene", "sobol")
-CAUSTICS = ("camera", "particles")
-BOUNDARIES = ("auto", "none", "primary", "all")
 EDGES = "edges"
 """Entry of `warned` that suppresses further notes about moving edges."""
 
@@ -66,15 +61,15 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
     for old, new in RENAMED.items():
         if old in props:
             raise PathreplayError(f"{name}: there is no property '{old}': it is called '{new}' now")
-    adjoint = choice(props, name, "adjoint", "auto", ADJOINTS)
+    adjoint = choice(props, name, declared.ADJOINT)
     if adjoint == "recorded" and max_depth > MAX_DEPTH:
         depth = "-1 (unbounded)" if max_depth == UNBOUNDED else max_depth
         raise PathreplayError(
             f"{name}: max_depth = {depth} is more than adjoint = 'recorded' can hold ({MAX_DEPTH}): "
             "use adjoint = 'replay', which has no limit"
         )
-    branch: str | bool = choice(props, name, "null_branching", "auto", NULL_BRANCHING)
-    recovery = Recovery(noise=deviation(props, name, "jacobian_noise", Recovery.noise))
+    branch: str | bool = choice(props, name, declared.NULL_BRANCHING)
+    recovery = Recovery(noise=deviation(props, name, declared.JACOBIAN_NOISE))
     auto = adjoint == "auto"
     if auto:
         adjoint = "recorded" if max_depth <= MAX_DEPTH else "replay"
@@ -84,21 +79,7 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
 class PathReplayIntegrator(PathIntegrator):
     """Differentiable path tracer for surfaces and media.
 
-    Properties, with the default first:
-
-    - ``max_depth``: 6; -1 is unbounded, which requires ``adjoint='replay'``.
-    - ``rr_depth``: 5.
-    - ``hide_emitters``: False.
-    - ``adjoint``: ``auto``, ``recorded`` or ``replay``, the reverse-mode method. ``auto`` records paths. If
-      ``max_depth`` exceeds the capacity of a record, ``auto`` replays them. If only emitters have gradients, ``auto``
-      uses `emission_only`. Forward mode ignores this property.
-    - ``attach``: ``delta``, ``all`` or ``none``, see `TraceConfig`.
-    - ``jacobian_noise``: 0.01, standard deviation of the perturbation of ray Jacobians in replay, see `Recovery`.
-    - ``null_branching``: ``auto``, True or False, see below.
-    - ``boundary``: ``auto``, ``none``, ``primary`` or ``all``, see below and `Boundary`.
-    - ``boundary_spp``: 0, segments per pixel; 0 means as many as the samples of the pass.
-    - ``caustics``: ``camera`` or ``particles``, which traces caustics from the emitters: see `ParticleTerm`.
-    - ``sampling``: ``sobol`` replaces an independent sampler by `OwenSobolSampler`; ``scene`` keeps it.
+    Properties: see `PATH_REPLAY` in `integrators/properties.py`.
 
     ``boundary = 'auto'`` means ``all`` if something that can occlude light moves (see `edges_move`) and its boundary
     term can be computed, otherwise ``none``. The term cannot be computed with an ``attach`` other than ``delta``, for
@@ -117,20 +98,20 @@ class PathReplayIntegrator(PathIntegrator):
     Raises PathreplayError for unknown or unusable properties and in polarised variants.
     """
 
-    name = "pathreplay"
+    name, properties = "pathreplay", declared.PATH_REPLAY
     without_light_paths = "take caustics = 'camera'"  # remedy in error messages, if light paths are not supported
     interior: PathReplay
 
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
-        self.attach = choice(props, self.name, "attach", "delta", ATTACH)
+        self.attach = choice(props, self.name, declared.ATTACH)
         self.moves_rays = self.attach != "none"  # whether parameters that move cameras and emitters receive gradients
         self.interior = _interior(self.name, props, self.max_depth)
         self.adjoint, self.null_branching = self.interior.adjoint, self.interior.branch
-        self.uses_sobol = choice(props, self.name, "sampling", "sobol", SAMPLING) == "sobol"
-        self.boundary = choice(props, self.name, "boundary", "auto", BOUNDARIES)
+        self.uses_sobol = choice(props, self.name, declared.SAMPLING) == "sobol"
+        self.boundary = choice(props, self.name, declared.BOUNDARY)
         self.boundary_spp = whole_number(
-            props, self.name, "boundary_spp", 0, lowest=0, kind="number of segments per pixel"
+            props, self.name, declared.BOUNDARY_SPP, lowest=0, kind="number of segments per pixel"
         )
         if self.boundary == "auto" and self.attach != "delta":
             self.boundary = "none"
@@ -139,7 +120,7 @@ class PathReplayIntegrator(PathIntegrator):
                 f"{self.name}: boundary = '{self.boundary}' with attach = '{self.attach}': boundary terms need "
                 "attach = 'delta': use that, or boundary = 'none'"
             )
-        split = self.name == "pathreplay" and choice(props, self.name, "caustics", "camera", CAUSTICS) == "particles"
+        split = self.name == "pathreplay" and choice(props, self.name, declared.CAUSTICS) == "particles"
         self.particles: ParticleTerm | None = ParticleTerm(self.max_depth, caustics=True) if split else None
         self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # the scene, and its learned state
 
@@ -404,7 +385,7 @@ class PathReplayIntegrator(PathIntegrator):
             "attach": self.attach,
             "jacobian_noise": self.interior.recovery.noise,
             "null_branching": self.null_branching,
-            "sampling": SAMPLING[self.uses_sobol],
+            "sampling": declared.SAMPLING.choices[self.uses_sobol],
             "boundary": self.boundary,
             "boundary_spp": self.boundary_spp,
             "caustics": self.caustics,
@@ -413,7 +394,7 @@ class PathReplayIntegrator(PathIntegrator):
     @property
     def caustics(self) -> str:
         """The value of the property ``caustics``; "particles" if all light is traced from the emitters."""
-        return CAUSTICS[self.particles is not None]
+        return declared.CAUSTICS.choices[self.particles is not None]
 
     def to_string(self) -> str:
         return self._described(
@@ -421,7 +402,7 @@ class PathReplayIntegrator(PathIntegrator):
             adjoint=self.adjoint,
             attach=self.attach,
             null_branching=self.null_branching,
-            sampling=SAMPLING[self.uses_sobol],
+            sampling=declared.SAMPLING.choices[self.uses_sobol],
             boundary=self.boundary,
             caustics=self.caustics,
         )

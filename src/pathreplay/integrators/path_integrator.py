@@ -20,7 +20,7 @@ from pathreplay.integrators.interior import image
 from pathreplay.integrators.lifetimes import careful, is_recording
 from pathreplay.integrators.parts import parts, summed
 from pathreplay.integrators.pass_state import PassState
-from pathreplay.integrators.properties import flag, whole_number
+from pathreplay.integrators.properties import HIDE_EMITTERS, MAX_DEPTH, PATHS, RR_DEPTH, flag, whole_number
 from pathreplay.integrators.reach import unreached_note
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import Learned, no_pixel_sweep, require_nothing_learned
@@ -63,15 +63,15 @@ def reached(scene: mi.Scene, sensor: Which, zero_is_error: bool = False) -> Iter
 class PathIntegrator:
     """Base of all integrators of this package: a template that `on_base` combines with Mitsuba's base class.
 
-    Properties: ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
-    Subclasses define ``name`` (of the plugin), ``attach`` (see `TraceConfig`) and the term ``interior``. Raises
-    PathreplayError for unusable properties and in polarised variants.
+    Properties: see `PATHS`.
+    Subclasses define ``name`` and ``properties`` (of the plugin), ``attach`` (see `TraceConfig`) and the term
+    ``interior``. Raises PathreplayError for unusable properties and in polarised variants.
 
     Methods whose names end in ``_pass`` take a `PassState`. Mitsuba's methods have no such parameter; they call `begin`
     before each pass and `keep` after it.
     """
 
-    name = ""
+    name, properties = "", PATHS
     attach = "none"
     uses_sobol = False  # whether Owen-scrambled Sobol samples replace independent samples
     boundary = "none"  # boundary terms that are estimated
@@ -88,9 +88,9 @@ class PathIntegrator:
                 f"use {mi.variant().replace('_polarized', '')!r}"
             )
         # Mitsuba reads these three properties as well, but validates less.
-        whole_number(props, self.name, "max_depth", 6, lowest=0, unbounded=True)
-        whole_number(props, self.name, "rr_depth", 5, lowest=1)
-        hide_emitters = flag(props, self.name, "hide_emitters", False)
+        whole_number(props, self.name, MAX_DEPTH, lowest=0, unbounded=True)
+        whole_number(props, self.name, RR_DEPTH, lowest=1)
+        hide_emitters = flag(props, self.name, HIDE_EMITTERS)
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
         self.warned: set[str] = set()  # notes that were logged or silenced

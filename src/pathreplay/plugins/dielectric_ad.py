@@ -22,23 +22,37 @@ scene is visible through a lobe, the integrator has to add a boundary term for t
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.properties import Property
 
 #: Largest probability of reflection from the denser side, except for total internal reflection.
 MAX_REFLECTION = 0.75
 TINTS = ("specular_reflectance", "specular_transmittance")
+INT_IOR = Property(
+    "int_ior",
+    "float or string",
+    "bk7",
+    "Index of refraction inside: a number, or the name of a material that Mitsuba knows.",
+    differentiable="eta",
+)
+EXT_IOR = replace(INT_IOR, name="ext_ior", default="air", meaning=INT_IOR.meaning.replace("inside", "outside"))
+REFLECTANCE = Property(TINTS[0], "spectrum or texture", 1.0, "Tint of the reflection.", differentiable=TINTS[0])
+TRANSMITTANCE = Property(TINTS[1], "spectrum or texture", 1.0, "Tint of the refraction.", differentiable=TINTS[1])
 
 
-def _index(props: mi.Properties, name: str, default: str) -> float:
+def _index(props: mi.Properties, declared: Property) -> float:
     """Read an index of refraction: a number, or the name of a material in Mitsuba's table."""
+    name = declared.name
     if name in props and props.type(name) == mi.Properties.Type.Integer:
         ior = float(props[name])
     else:
         try:
-            ior = float(mi.lookup_ior(props, name, default))
+            ior = float(mi.lookup_ior(props, name, declared.default))
         except RuntimeError:
             raise PathreplayError(
                 f"dielectric_ad: {name} = {props[name]!r:.60} is not a material known to Mitsuba; give a number, "
@@ -52,6 +66,7 @@ def _index(props: mi.Properties, name: str, default: str) -> float:
 class DielectricAD:
     """A smooth dielectric with differentiable index of refraction. `on_base` combines this template with `mi.BSDF`."""
 
+    properties = (INT_IOR, EXT_IOR, REFLECTANCE, TRANSMITTANCE)
     specular_reflectance: mi.Texture | None  # None: the tint is 1, and no texture is evaluated
     specular_transmittance: mi.Texture | None
 
@@ -62,9 +77,10 @@ class DielectricAD:
                 f"dielectric_ad: the polarised variant {mi.variant()} is not supported; use "
                 f"{mi.variant().replace('_polarized', '')}, or Mitsuba's dielectric without derivatives"
             )
-        self.eta = mi.Float(_index(props, "int_ior", "bk7") / _index(props, "ext_ior", "air"))
-        for name in TINTS:
-            setattr(self, name, props.get_texture(name, 1.0) if name in props else None)
+        self.eta = mi.Float(_index(props, INT_IOR) / _index(props, EXT_IOR))
+        for tint in (REFLECTANCE, TRANSMITTANCE):
+            name = tint.name
+            setattr(self, name, props.get_texture(name, tint.default) if name in props else None)
         both_sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
         self.m_components = [
             mi.BSDFFlags.DeltaReflection | both_sides,

@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.properties import Property
 from pathreplay.plugins import grid_traversal
 from pathreplay.plugins.supergrid import (
     Bounds,
@@ -37,9 +38,44 @@ from pathreplay.plugins.supergrid import (
 FAR = 1e6
 
 
+SIGMA_T = Property(
+    "sigma_t", "volume or float", 1.0, "Extinction per unit length, at least 0.", differentiable="sigma_t.data"
+)
+SCALE = Property("scale", "float", 1.0, "Factor of `sigma_t`.", differentiable="scale")
+ALBEDO = Property(
+    "albedo",
+    "volume or spectrum",
+    0.75,
+    "Fraction of the extinction that scatters.",
+    differentiable="albedo.data",
+)
+EMISSION = Property(
+    "emission",
+    "volume or spectrum",
+    None,
+    "Radiance emitted per unit length, which `scale` does not scale. Absent: no emission.",
+    differentiable="emission.data",
+)
+SUPERGRID = Property(
+    "supergrid",
+    "string or boolean",
+    "auto",
+    "Local majorants in the cells of a coarse grid, or one global majorant. `auto` selects the cheapest cell size.",
+    ("auto", True, False),
+)
+PHASE = Property(
+    "(nested plugin)",
+    "phase function",
+    None,
+    "Any phase function but microflakes (SGGX). Absent: isotropic.",
+    differentiable="phase_function.…",
+)
+
+
 class GridMedium:
     """A heterogeneous medium on grids, with local majorants. `on_base` combines this template with `mi.Medium`."""
 
+    properties = (SIGMA_T, SCALE, ALBEDO, EMISSION, SUPERGRID, PHASE)
     phase_function: Callable[[], mi.PhaseFunction]  # a method of `mi.Medium`
 
     def __init__(self, props: mi.Properties) -> None:
@@ -50,10 +86,10 @@ class GridMedium:
                 f"gridmedium: with the phase function {phase.class_name()} the density depends on the "
                 "direction, which majorants do not support; use Mitsuba's heterogeneous"
             )
-        self.sigma_t = _volume(props, "sigma_t", 1.0)
-        self.albedo = _volume(props, "albedo", 0.75)
-        self.emission = _volume(props, "emission", None)
-        self.scale = mi.Float(_number(props, "scale", 1.0))
+        self.sigma_t = _volume(props, SIGMA_T)
+        self.albedo = _volume(props, ALBEDO)
+        self.emission = _volume(props, EMISSION)
+        self.scale = mi.Float(_number(props, SCALE))
         self.supergrid = _choice(props)
         self.m_is_homogeneous = False
         self.parameters_changed([])
@@ -170,9 +206,10 @@ class GridMedium:
 # ---------------------------------------------- reading the properties ----------------------------------------------
 
 
-def _volume(props: mi.Properties, name: str, default: float | None) -> Any:
-    """Read the volume ``name``, or return None. Textures, colours and numbers become a very large `constvolume`."""
-    value = props[name] if name in props else default
+def _volume(props: mi.Properties, declared: Property) -> Any:
+    """Read a volume, or return None. Textures, colours and numbers become a very large `constvolume`."""
+    name = declared.name
+    value = props[name] if name in props else declared.default
     if value is None or isinstance(value, mi.Volume):
         return value
     if isinstance(value, (str, bool)) or (isinstance(value, mi.Object) and not isinstance(value, mi.Texture)):
@@ -183,15 +220,15 @@ def _volume(props: mi.Properties, name: str, default: float | None) -> Any:
     return mi.PluginManager.instance().create_object(constant)
 
 
-def _number(props: mi.Properties, name: str, default: float) -> float:
-    value = props.get(name, default)
+def _number(props: mi.Properties, declared: Property) -> float:
+    value = props.get(declared.name, declared.default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < float("inf"):
-        raise PathreplayError(f"gridmedium: {name} is {value}; give a finite number, at least 0")
+        raise PathreplayError(f"gridmedium: {declared.name} is {value}; give a finite number, at least 0")
     return float(value)
 
 
 def _choice(props: mi.Properties) -> bool | str:
-    value = props.get("supergrid", "auto")
+    value = props.get(SUPERGRID.name, SUPERGRID.default)
     if value != "auto" and not isinstance(value, bool):
         raise PathreplayError(f"gridmedium: supergrid is {value!r}; use true, false or 'auto'")
     return value

@@ -16,11 +16,18 @@ from pathreplay.integrators.baselines.radiative import no_forward, radiative
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.interior import back_propagate, tangent
 from pathreplay.integrators.path_integrator import PathIntegrator
-from pathreplay.integrators.properties import choice, flag
+from pathreplay.integrators.properties import PATHS, choice, flag
 from pathreplay.integrators.term import TermResult
+from pathreplay.platform.properties import Property
 from pathreplay.transport.vertex import TraceConfig
 
-ATTACH = ("delta", "none")
+ATTACH = Property("attach", "string", "delta", "As in `pathreplay`, without `all`.", ("delta", "none"))
+LINEAR = Property(
+    "linear",
+    "boolean",
+    False,
+    "False is unbiased, and its time grows with the square of the depth. True is a biased variant in linear time.",
+)
 
 
 @dataclass(frozen=True)
@@ -52,12 +59,12 @@ class NaiveIntegrator(PathIntegrator):
     Properties: as in `PathIntegrator`, and ``attach`` (``delta``, ``none``) as in `pathreplay`.
     """
 
-    name = "naive_ad"
+    name, properties = "naive_ad", (*PATHS, ATTACH)
     interior = OtherInterior(tape_backward, tape_forward)
 
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
-        self.attach = choice(props, self.name, "attach", "delta", ATTACH)
+        self.attach = choice(props, self.name, ATTACH)
 
 
 class RadiativeIntegrator(PathIntegrator):
@@ -67,11 +74,11 @@ class RadiativeIntegrator(PathIntegrator):
     in linear time, see `radiative`. Motion is not differentiated, and there is no forward mode.
     """
 
-    name = "radiative_backprop"
+    name, properties = "radiative_backprop", (*PATHS, LINEAR)
 
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
-        linear = flag(props, self.name, "linear", False)
+        linear = flag(props, self.name, LINEAR)
         self.interior = OtherInterior(partial(radiative, linear=linear), no_forward)
 
 

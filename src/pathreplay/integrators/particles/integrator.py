@@ -11,7 +11,7 @@ from pathreplay.integrators.integrator import PathReplayIntegrator
 from pathreplay.integrators.particles.term import ParticleTerm
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.path_integrator import PathIntegrator
-from pathreplay.integrators.properties import whole_number
+from pathreplay.integrators.properties import PARTICLES, SAMPLES_PER_PASS, whole_number
 from pathreplay.integrators.term import Term
 from pathreplay.transport.vertex import TraceConfig
 
@@ -39,16 +39,7 @@ class ParticleIntegrator(PathReplayIntegrator):
     pixels times the samples per pixel. Emitters that the sensor sees directly are rendered with camera rays. Their
     number is limited to 2^20 in total or 16 per pixel, whichever is more.
 
-    Properties, with the default first:
-
-    - ``max_depth``: 6; -1 is unbounded, which derivatives do not support.
-    - ``rr_depth``: 5.
-    - ``hide_emitters``: False; whether emitters that the sensor sees directly are hidden.
-    - ``samples_per_pass``: accepted for compatibility with ``ptracer``. It has no effect, because memory does not
-      depend on the number of paths.
-    - ``attach``, ``boundary`` and ``boundary_spp``: as in `PathReplayIntegrator`. The boundary term contains the edges
-      of directly visible emitters only.
-    - Other properties of `PathReplayIntegrator`, except ``caustics``, apply to the camera rays only.
+    Properties: see `PARTICLES` in `integrators/properties.py`.
 
     Sensors: ``perspective``, ``thinlens``, ``orthographic`` and ``irradiancemeter``. The image is the same as with
     ``sample_border = true`` in the film (see `ParticleFilm`).
@@ -58,12 +49,12 @@ class ParticleIntegrator(PathReplayIntegrator):
     Raises PathreplayError for unknown or unusable properties, for scenes with media, and in polarised variants.
     """
 
-    name = "pathreplay_particles"
+    name, properties = "pathreplay_particles", PARTICLES
     without_light_paths = "take the integrator 'pathreplay'"
     particles: ParticleTerm
 
     def __init__(self, props: mi.Properties) -> None:
-        whole_number(props, self.name, "samples_per_pass", -1, lowest=1, unbounded=True, kind="number of samples")
+        whole_number(props, self.name, SAMPLES_PER_PASS, lowest=1, unbounded=True, kind="number of samples")
         PathReplayIntegrator.__init__(self, props)
         self.particles = ParticleTerm(self.max_depth, caustics=False)
 

@@ -1,0 +1,29 @@
+"""Declarations of plugin properties, from which plugins read their defaults and the reference of plugins is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Property:
+    """A property of a plugin.
+
+    Args:
+        name: name of the property in XML and in dictionaries.
+        kind: type of the value, such as ``integer`` or ``texture``.
+        default: default value; None if the property has none, or if its meaning states the default.
+        meaning: what the property selects, as statements in Markdown.
+        choices: all valid values, if there are few.
+        see: page and heading below ``docs/`` that say more.
+        differentiable: key of the parameter that carries gradients, or "".
+    """
+
+    name: str
+    kind: str
+    default: Any
+    meaning: str
+    choices: tuple[Any, ...] = ()
+    see: str = ""
+    differentiable: str = ""
