@@ -21,7 +21,7 @@ author = "The pathreplay authors"
 version = release = pathreplay.__version__
 project_copyright = author
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "mathml"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "mathml", "sections"]
 root_doc = "docs/index"
 include_patterns = ["docs/**.md", "examples/*/README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"]
 exclude_patterns = [".*", "build", "dist", "runs", "src", "tests", "benchmarks", "stubs", "**/__pycache__"]
@@ -38,6 +38,8 @@ highlight_language = "none"
 default_role = "py:obj"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
+# Signatures need no framework.
+autodoc_mock_imports = ["torch", "jax"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 python_maximum_signature_line_length = 88

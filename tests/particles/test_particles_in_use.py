@@ -154,8 +154,8 @@ PROPERTIES: dict[str, tuple[dict, str]] = {
     ),
     "caustics of particles": ({**PARTICLES, "caustics": "particles"}, "caustics"),
     "samples_per_pass": (
-        {**PARTICLES, "samples_per_pass": 0},
-        "pathreplay_particles: samples_per_pass = 0: use -1 (unbounded) or a number of samples >= 1",
+        {**PARTICLES, "samples_per_pass": -1},
+        "pathreplay_particles: samples_per_pass = -1: use a number of samples >= 1",
     ),
     "depth": ({**PARTICLES, "max_depth": -2}, "pathreplay_particles: max_depth = -2: use -1 (unbounded)"),
     "boundary": ({**PARTICLES, "boundary": "some"}, "pathreplay_particles: boundary = 'some' is unknown"),

@@ -110,8 +110,8 @@ PATH_REPLAY: tuple[Property, ...] = (
 SAMPLES_PER_PASS = Property(
     "samples_per_pass",
     "integer",
-    -1,
-    "Accepted for compatibility with `ptracer`. It has no effect, because memory does not depend on the number of paths.",
+    None,
+    "Accepted as in `ptracer`, without effect: memory does not depend on the number of light paths.",
 )
 PARTICLES: tuple[Property, ...] = (
     replace(

@@ -41,8 +41,10 @@ INT_IOR = Property(
     differentiable="eta",
 )
 EXT_IOR = replace(INT_IOR, name="ext_ior", default="air", meaning=INT_IOR.meaning.replace("inside", "outside"))
-REFLECTANCE = Property(TINTS[0], "spectrum or texture", 1.0, "Tint of the reflection.", differentiable=TINTS[0])
-TRANSMITTANCE = Property(TINTS[1], "spectrum or texture", 1.0, "Tint of the refraction.", differentiable=TINTS[1])
+REFLECTANCE = Property(TINTS[0], "spectrum or texture", 1.0, "Tint of the reflection.", differentiable=f"{TINTS[0]}.…")
+TRANSMITTANCE = Property(
+    TINTS[1], "spectrum or texture", 1.0, "Tint of the refraction.", differentiable=f"{TINTS[1]}.…"
+)
 
 
 def _index(props: mi.Properties, declared: Property) -> float:

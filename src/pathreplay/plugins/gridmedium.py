@@ -39,7 +39,7 @@ FAR = 1e6
 
 
 SIGMA_T = Property(
-    "sigma_t", "volume or float", 1.0, "Extinction per unit length, at least 0.", differentiable="sigma_t.data"
+    "sigma_t", "volume or float", 1.0, "Extinction per unit length, at least 0.", differentiable="sigma_t.…"
 )
 SCALE = Property("scale", "float", 1.0, "Factor of `sigma_t`.", differentiable="scale")
 ALBEDO = Property(
@@ -47,14 +47,14 @@ ALBEDO = Property(
     "volume or spectrum",
     0.75,
     "Fraction of the extinction that scatters.",
-    differentiable="albedo.data",
+    differentiable="albedo.…",
 )
 EMISSION = Property(
     "emission",
     "volume or spectrum",
     None,
     "Radiance emitted per unit length, which `scale` does not scale. Absent: no emission.",
-    differentiable="emission.data",
+    differentiable="emission.…",
 )
 SUPERGRID = Property(
     "supergrid",

@@ -54,7 +54,8 @@ class ParticleIntegrator(PathReplayIntegrator):
     particles: ParticleTerm
 
     def __init__(self, props: mi.Properties) -> None:
-        whole_number(props, self.name, SAMPLES_PER_PASS, lowest=1, unbounded=True, kind="number of samples")
+        if SAMPLES_PER_PASS.name in props:
+            whole_number(props, self.name, SAMPLES_PER_PASS, lowest=1, kind="number of samples")
         PathReplayIntegrator.__init__(self, props)
         self.particles = ParticleTerm(self.max_depth, caustics=False)
 

@@ -31,7 +31,7 @@ RELATIVE_FLOOR = 1e-2
 
 
 def l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Compute |I - T|. Noise in I biases the gradient."""
+    """Compute ``|I - T|``. Noise in I biases the gradient."""
     return dr.abs(image - target)
 
 
@@ -41,7 +41,7 @@ def l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 def relative_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Compute ((I - T) / (|T| + floor))², which emphasises dark regions. The gradient is unbiased, as for ``l2``."""
+    """Compute ``((I - T) / (|T| + floor))²``, which emphasises dark regions. The gradient is unbiased."""
     return dr.square((image - target) / (dr.abs(target) + RELATIVE_FLOOR))
 
 
@@ -55,12 +55,12 @@ def log(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 def relative_l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Compute |I - T| / (|T| + floor). Noise in I biases the gradient."""
+    """Compute ``|I - T| / (|T| + floor)``. Noise in I biases the gradient."""
     return dr.abs(image - target) / (dr.abs(target) + RELATIVE_FLOOR)
 
 
 def smape(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Compute |I - T| / (|I| + |T| + floor), which is below 1 for any brightness. Noise in I biases the gradient."""
+    """Compute ``|I - T| / (|I| + |T| + floor)``, which is always below 1. Noise in I biases the gradient."""
     return dr.abs(image - target) / (dr.abs(image) + dr.abs(target) + RELATIVE_FLOOR)
 
 
