@@ -53,6 +53,10 @@ $(READY): pyproject.toml constraints.txt
 	@touch $@
 
 $(DOCS_READY): $(READY)
+	@$(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "make: error: the documentation needs Python 3.11 or newer: make clean, then" \
+	    "make docs PYTHON=python3.12" >&2; \
+	  exit 2; }
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,docs]'
 	@touch $@
 
@@ -95,7 +99,7 @@ coverage: $(READY)
 bench: $(READY)
 	$(BIN)/python -m benchmarks $(TASKS)
 
-# Sphinx writes the site, and warnings are errors. Notebooks run if they have changed: NOTEBOOKS=off does not run them.
+# Sphinx writes the site, and warnings are errors. Notebooks run if they have changed, or not at all with NOTEBOOKS=off.
 NOTEBOOKS ?= cache
 docs: $(DOCS_READY)
 	PATHREPLAY_DOCS_NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -q -W --keep-going -c docs -d build/doctrees . build/site
