@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TypeVar
 
 import mitsuba as mi
 
 from pathreplay.adjoint.ray_jacobian import Recovery
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.platform.properties import Property
+
+T = TypeVar("T")
 
 #: Largest integer that Mitsuba's integrators can store.
 LARGEST = 2**31 - 1
@@ -61,7 +63,7 @@ SAMPLING = Property(
     ("scene", "sobol"),
     "gradients.md#low-discrepancy-sampling",
 )
-NULL_BRANCHING = Property(
+NULL_BRANCHING: Property[str | bool] = Property(
     "null_branching",
     "string or boolean",
     "auto",
@@ -94,8 +96,8 @@ CAUSTICS = Property(
     ("camera", "particles"),
     "particles.md",
 )
-PATHS: tuple[Property, ...] = (MAX_DEPTH, RR_DEPTH, HIDE_EMITTERS)
-PATH_REPLAY: tuple[Property, ...] = (
+PATHS: tuple[Property[object], ...] = (MAX_DEPTH, RR_DEPTH, HIDE_EMITTERS)
+PATH_REPLAY: tuple[Property[object], ...] = (
     *PATHS,
     ADJOINT,
     ATTACH,
@@ -113,7 +115,7 @@ SAMPLES_PER_PASS = Property(
     None,
     "Accepted as in `ptracer`, without effect: memory does not depend on the number of light paths.",
 )
-PARTICLES: tuple[Property, ...] = (
+PARTICLES: tuple[Property[object], ...] = (
     replace(
         MAX_DEPTH,
         meaning="Longest path in segments: 2 is light that was scattered once. -1 is unbounded, which derivatives do "
@@ -134,7 +136,7 @@ PARTICLES: tuple[Property, ...] = (
 )
 
 
-def choice(props: mi.Properties, plugin: str, declared: Property) -> Any:
+def choice(props: mi.Properties, plugin: str, declared: Property[T]) -> T:
     """Read a property. Raises PathreplayError if its value is not one of its choices."""
     value = props.get(declared.name, declared.default)
     # Compare types as well, since 1 == True.
@@ -147,7 +149,7 @@ def choice(props: mi.Properties, plugin: str, declared: Property) -> Any:
 def whole_number(
     props: mi.Properties,
     plugin: str,
-    declared: Property,
+    declared: Property[object],
     lowest: int,
     unbounded: bool = False,
     kind: str = "depth",
@@ -166,7 +168,7 @@ def whole_number(
     )
 
 
-def deviation(props: mi.Properties, plugin: str, declared: Property) -> float:
+def deviation(props: mi.Properties, plugin: str, declared: Property[object]) -> float:
     """Read a standard deviation. Raises PathreplayError if the value is not a finite number of at least 0."""
     value = props.get(declared.name, declared.default)
     if type(value) not in (int, float) or not 0 <= value < float("inf"):
@@ -176,7 +178,7 @@ def deviation(props: mi.Properties, plugin: str, declared: Property) -> float:
     return float(value)
 
 
-def flag(props: mi.Properties, plugin: str, declared: Property) -> bool:
+def flag(props: mi.Properties, plugin: str, declared: Property[object]) -> bool:
     """Read a boolean property. Raises PathreplayError if the value is not a boolean."""
     value = props.get(declared.name, declared.default)
     if type(value) is not bool:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Generic, TypeVar
+
+T = TypeVar("T", covariant=True)
 
 
 @dataclass(frozen=True)
-class Property:
+class Property(Generic[T]):
     """A property of a plugin.
 
     Args:
@@ -22,8 +24,8 @@ class Property:
 
     name: str
     kind: str
-    default: Any
+    default: T
     meaning: str
-    choices: tuple[Any, ...] = ()
+    choices: tuple[T, ...] = ()
     see: str = ""
     differentiable: str = ""

@@ -47,7 +47,7 @@ TRANSMITTANCE = Property(
 )
 
 
-def _index(props: mi.Properties, declared: Property) -> float:
+def _index(props: mi.Properties, declared: Property[str]) -> float:
     """Read an index of refraction: a number, or the name of a material in Mitsuba's table."""
     name = declared.name
     if name in props and props.type(name) == mi.Properties.Type.Integer:

@@ -206,7 +206,7 @@ class GridMedium:
 # ---------------------------------------------- reading the properties ----------------------------------------------
 
 
-def _volume(props: mi.Properties, declared: Property) -> Any:
+def _volume(props: mi.Properties, declared: Property[object]) -> Any:
     """Read a volume, or return None. Textures, colours and numbers become a very large `constvolume`."""
     name = declared.name
     value = props[name] if name in props else declared.default
@@ -220,7 +220,7 @@ def _volume(props: mi.Properties, declared: Property) -> Any:
     return mi.PluginManager.instance().create_object(constant)
 
 
-def _number(props: mi.Properties, declared: Property) -> float:
+def _number(props: mi.Properties, declared: Property[object]) -> float:
     value = props.get(declared.name, declared.default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < float("inf"):
         raise PathreplayError(f"gridmedium: {declared.name} is {value}; give a finite number, at least 0")
