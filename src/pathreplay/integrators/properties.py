@@ -44,7 +44,7 @@ ATTACH = Property(
     "attach",
     "string",
     "delta",
-    "Which sampled directions are differentiated: those of mirrors and smooth glass (`delta`), `all`, or `none`.",
+    "Which sampled directions depend on parameters: those of mirrors and smooth glass (`delta`), `all`, or `none`.",
     ("delta", "all", "none"),
     "gradients.md#attach",
 )
@@ -113,7 +113,7 @@ SAMPLES_PER_PASS = Property(
     "samples_per_pass",
     "integer",
     None,
-    "Accepted as in `ptracer`, without effect: memory does not depend on the number of light paths.",
+    "Accepted for compatibility with `ptracer`. It has no effect: memory does not depend on the number of light paths.",
 )
 PARTICLES: tuple[Property[object], ...] = (
     replace(
@@ -121,7 +121,11 @@ PARTICLES: tuple[Property[object], ...] = (
         meaning="Longest path in segments: 2 is light that was scattered once. -1 is unbounded, which derivatives do "
         "not support.",
     ),
-    replace(RR_DEPTH, meaning="Depth from which Russian roulette may end a path, by its throughput since the emitter."),
+    replace(
+        RR_DEPTH,
+        meaning="Depth from which Russian roulette may end a path, with a probability that depends on its throughput "
+        "since the emitter.",
+    ),
     replace(HIDE_EMITTERS, meaning="The sensor does not see emitters, and sees through them."),
     SAMPLES_PER_PASS,
     replace(ATTACH, meaning=f"{ATTACH.meaning} `none` leaves out all motion."),

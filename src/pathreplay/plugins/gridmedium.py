@@ -67,7 +67,7 @@ PHASE = Property(
     "(nested plugin)",
     "phase function",
     None,
-    "Any phase function but microflakes (SGGX). Absent: isotropic.",
+    "Any phase function except microflakes (SGGX), which are refused. Absent: isotropic.",
     differentiable="phase_function.…",
 )
 
