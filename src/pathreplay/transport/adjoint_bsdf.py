@@ -5,8 +5,9 @@ light path carries flux, which is proportional to the cosine with the geometric 
 
     F |ω_c·n_g| / |ω_l·n_g|        [Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, p. 155]
 
-Here F is evaluated exactly as on camera paths, with ``wi`` = ω_c and ``wo`` = ω_l. This includes BSDFs that perturb the
-normal (`bumpmap`, `normalmap`), whose n_s Mitsuba does not return. On light paths, ``si.wi`` is ω_l.
+Here F is evaluated exactly as on camera paths, with ``wi`` = ω_c and ``wo`` = ω_l. The factor does not contain n_s. It
+is therefore also correct for BSDFs that perturb the normal (`bumpmap`, `normalmap`), for which Mitsuba does not return
+n_s. On light paths, ``si.wi`` is ω_l.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ def delta_adjoint(v: Vertex, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
     """Return the factor by which the weight of a delta lobe sampled in importance mode must be multiplied.
 
     The normal at which the light is reflected or refracted is parallel to h = ω_l + η ω_c, with η the relative index of
-    refraction across the lobe. The factor contains |h·ω_l| / |h·ω_c|: refraction changes solid angles by this ratio and
-    by a power of η, which importance mode omits.
+    refraction across the lobe. The factor contains |h·ω_l| / |h·ω_c|, because refraction changes solid angles by this
+    ratio times a power of η. The power of η is not part of weights in importance mode.
     """
     cos = dr.dot(v.si.wi, wo)
     a, b = 1 + eta * cos, cos + eta  # h·ω_l and h·ω_c

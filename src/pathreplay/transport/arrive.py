@@ -101,8 +101,8 @@ def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
 def sees_lights(trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
     """Return the lanes in which emission along the ray is visible.
 
-    With ``hide_emitters``, the environment is invisible to the camera. If caustics are omitted, only the environment is
-    visible along delta lobes of paths that have scattered before.
+    With ``hide_emitters``, the environment is invisible to the camera. If caustics are omitted, area lights are
+    invisible along delta lobes, on paths whose first vertex has scattered with a smooth lobe.
     """
     if trace.without_caustics:
         active = active & ~(at.delta & at.scattered & si.is_valid())

@@ -16,7 +16,7 @@ from pathreplay.transport.signature import shape_met
 from pathreplay.transport.vertex import TraceConfig
 
 ROUNDING = 2.0**-22
-"""Bound on the rounding error of n v = s + k, divided by k + 1. Here s is the local parameter of segment k."""
+"""The rounding error of n v in segment k is at most this value times k + 1."""
 
 
 def meet(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.PreliminaryIntersection3f:

@@ -1,4 +1,4 @@
-"""Find which parts of a path depend on differentiated parameters, at trace time, so that kernels omit the rest."""
+"""Find which parts of a path depend on differentiated parameters, so that kernels omit derivatives of other parts."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def _sight(link: SensorLink, v: arrive.Vertex, u: VertexSamples, active: mi.Bool
 
 
 def _unoccluded(trace: TraceConfig, v: arrive.Vertex, to: Sighting, active: mi.Bool) -> mi.Bool:
-    """Test whether the sensor sees a vertex. With ``hide_emitters``, area emitters are transparent and hidden."""
+    """Test whether the sensor sees a vertex. With ``hide_emitters``, area emitters are hidden and occlude nothing."""
     ray = v.origin.spawn_ray_to(to.end)
     if not (trace.hide_emitters and trace.traits.area_lights):
         return ~trace.scene.ray_test(ray, active)

@@ -169,8 +169,8 @@ def _at_surface(
         f = smooth_adjoint(v, wo, smooth)
     w = f * J * dr.detach(reciprocal(kept.pdf))
     # A failed sample has weight zero even if f is not zero (`roughdielectric` may sample a reflected direction on the
-    # wrong side of the surface). The weight of a black BSDF is also zero, but here f is zero, and the derivative of the
-    # weight is kept.
+    # wrong side of the surface). If the weight is zero because the BSDF is black, f is zero as well. The derivative of
+    # the weight is then kept.
     w = dr.select(kept.black & dr.any(dr.detach(f) != 0), 0, w)
 
     if attached and trace.resamples:
@@ -185,9 +185,9 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
     """Return the lanes with narrow lobes, in which smooth continuations have a fixed direction.
 
     If the direction followed a moving hit point, the value of the lobe would change with the direction. In a narrow
-    lobe, this derivative is large and noisy. Edges move across a fixed direction, which is therefore used only if
-    boundary terms are estimated. The criterion depends on vertex and incident ray only, so that all directions sampled
-    at a vertex move by the same rule.
+    lobe, this derivative is large and noisy. Edges may move across a fixed direction, and their motion is a boundary
+    term. All lanes are therefore False unless boundary terms are estimated. The criterion depends on vertex and
+    incident ray only, so that all directions sampled at a vertex move by the same rule.
     """
     if not (trace.may_slide and trace.traits.glossy):
         return mi.Bool(False)
@@ -243,7 +243,7 @@ def _delta_weight(
         alone = mi.BSDFContext(ctx.mode)
         alone.component = k
         # On the back of a two-sided BSDF, ``sampled_component`` is numbered from zero, but ``component`` continues the
-        # numbering of the front. All components are then tried.
+        # numbering of the front. If a scene has two-sided BSDFs, all components are therefore tried.
         picked = missing if trace.traits.two_sides else missing & (kept.lobe == k)
         sample, w_k = v.bsdf.sample(alone, v.si, u.lobe, u.direction, picked)
         w_k *= dr.detach(reciprocal(kept.pdf))

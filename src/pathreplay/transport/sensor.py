@@ -24,10 +24,10 @@ class Sighting:
     """A connection from a point to the sensor."""
 
     d: mi.Vector3f  # unit direction to the sensor
-    end: mi.Point3f  # end of the segment: on the aperture, moved to the near plane of a camera
+    end: mi.Point3f  # point up to which occlusion is tested: on the near plane of a camera, or on the irradiance meter
     s: mi.Point2f  # film position in pixels, relative to the crop window
     W: mi.Float  # importance over the density of the aperture sample
-    valid: mi.Bool  # the sensor sees the point, up to occlusion, on the film or within ``reach`` pixels of it
+    valid: mi.Bool  # without occluders, the sensor sees the point; ``s`` may be up to ``reach`` pixels outside
 
     @staticmethod
     def none() -> Sighting:

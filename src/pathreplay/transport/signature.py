@@ -62,7 +62,7 @@ def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
 
 
 def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
-    """Compute the unit vector perpendicular to the ray and to the edge of the shape next to the hit. Detached.
+    """Compute the unit vector perpendicular to the ray and to an edge near the hit. Detached.
 
     The edge is the nearest side of the triangle on meshes, the rim on rectangles and disks, the nearer of rim and
     silhouette on tubes, and the silhouette on other shapes.

@@ -1,4 +1,4 @@
-"""Velocity field of smooth continuations under motion: follow the next hit point or keep the direction.
+"""Velocity of sampled directions while the scene moves: a blend of following the next hit point and staying constant.
 
 Let x be a vertex, y the hit point of its continuation along d, and r = |y - x|. An integral over directions does not
 depend on its parametrisation. When the parameters change, the direction d may therefore move with any velocity field
@@ -74,7 +74,7 @@ def moved_direction(
 def jumps_at_facets(
     lengths: mi.Float, origin: mi.Interaction3f, hit: mi.PreliminaryIntersection3f, p: mi.Point3f, n: mi.Normal3f
 ) -> mi.Bool:
-    """Return whether V is discontinuous between the facets at ``hit``.
+    """Return whether V jumps between the triangle at ``hit`` and the adjacent triangles of the mesh.
 
     ``p`` and ``n`` are position and normal at the hit. Near the surface, φ depends on the plane of the triangle.
     """

@@ -23,7 +23,7 @@ difference between the two texels."""
 
 
 def has_seams(textures: Iterable[mi.Texture]) -> bool:
-    """Return whether one of the textures is discontinuous. Bitmaps do not expose their filter, but can be evaluated."""
+    """Return whether a texture is discontinuous. Bitmaps are evaluated, because they do not expose their filter."""
     return any(map(_jumps, textures))
 
 

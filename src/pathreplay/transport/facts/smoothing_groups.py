@@ -31,9 +31,10 @@ def mesh_smoothing_groups(mesh: mi.Mesh) -> np.ndarray:
 def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WELD) -> np.ndarray:
     """Return the group index of each triangle; all indices are zero in a mesh without edges.
 
-    Triangles connected by common vertices form a group. Two triangles of one group can also be adjacent across an edge,
-    for example if the edge ends inside the group. Such triangles become separate groups. Vertices coincide if their
-    distance is at most ``weld`` times the mesh's diagonal plus rounding. For ``weld`` = 0 they must be equal.
+    Triangles connected by common vertices form a group. If an edge ends inside a group, triangles of this group meet
+    across the edge: they have two positions in common, but no vertex. Each such triangle becomes a group of its own.
+    Two positions count as equal if their distance is at most ``weld`` times the mesh's diagonal plus rounding. For
+    ``weld`` = 0 they must be exactly equal.
     """
     count = len(positions)
     links = coo_matrix((np.ones(faces.size, bool), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), (count, count))

@@ -263,8 +263,8 @@ def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
     """Return whether the scene has a single shape, from whose points no edge is visible.
 
-    A flat shape is not visible from its own points. The inside of a sphere is, but has no edge unless a texture has a
-    seam.
+    A flat shape is not visible from its own points. The inside of a sphere is visible from its own points, but has no
+    edge unless a texture has a seam.
     """
     if len(shapes) != 1 or shapes[0].is_emitter():
         return False

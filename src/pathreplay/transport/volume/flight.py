@@ -160,9 +160,9 @@ def fly_again(
 ) -> Flown:
     """Evaluate a recorded flight again, differentiable in the coefficients and, if ``attached``, in ray and ``reach``.
 
-    ``reach`` is the distance to the surface, or infinity if there is none. The position of a collision relative to the
-    two ends of the medium on its ray is constant. The collision thus moves with the ray and with the surface, and no
-    derivative is lost at the end of the flight.
+    ``reach`` is the distance to the surface, or infinity if there is none. The medium covers an interval of the ray,
+    and a collision keeps its relative position in this interval. The collision thus moves with the ray and with the
+    surface, and never crosses an end of the interval. Such a crossing would add a boundary term.
 
     Let a and t be the ends of the flight, y points on the flight, x the collision, and b any function of position and
     direction (`TraceConfig.baseline`). The control variate
