@@ -15,7 +15,7 @@ from pathreplay.transport.vertex import Arrival, Step, TraceConfig, VertexRecord
 
 
 class Unreached(PathreplayError):
-    """Raised if the light paths depend on no parameter with gradients. Callers that know the scene add a remedy."""
+    """Raised if the light paths depend on no parameter with gradients. Callers add a remedy to the message."""
 
 
 @dataclass

@@ -31,7 +31,7 @@ AVERAGES = 2 * CELLS**3 * SIDES**2  # X and Y side by side
 MEMORY = 0.9
 # Initial relative weight c of null collisions (see `branch_weight`): the value for fifty null collisions per path.
 FIRST_BRANCHING = 0.02
-# Number of partial sums over which the numbers of null collisions are distributed.
+# Null collisions are counted in this many partial sums, so that no sum is too large for float32.
 SLOTS = 256
 # Weight of the mean over all cells in the average of one cell, in units of samples of this cell.
 PRIOR = 2.0

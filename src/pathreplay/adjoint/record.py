@@ -83,7 +83,7 @@ class Layout:
     passes: bool
     branch: bool
     splits: bool  # caustics are omitted
-    always: bool = True  # condition of the fields in every record
+    always: bool = True  # condition of the fields that every record contains
 
     @property
     def varies(self) -> bool:
@@ -233,7 +233,7 @@ def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> VertexRecord:
 
 
 def _blank(layout: Layout, ray0: mi.Ray3f) -> VertexRecord:
-    """Return a vertex with default values. Fields that are not recorded keep them."""
+    """Create a vertex with default values, in which `_read` replaces the recorded fields."""
     zero, no = mi.Float(0), mi.Bool(False)
     ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0), ray0.time, ray0.wavelengths)
     at = Arrival(ray, dr.zeros(mi.PreliminaryIntersection3f), zero, no, no)
