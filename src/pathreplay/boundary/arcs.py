@@ -31,7 +31,7 @@ UNIFORM = 0.25
 LENGTHS = 3
 """Number of arc lengths; each is a quarter of the previous one."""
 BROAD = 256.0
-"""Density up to which the longest arcs are short enough: the density of a metal lobe of roughness 0.02."""
+"""The longest arcs are short enough for lobes of at most this density, which a metal of roughness 0.02 has."""
 ANY_LENGTH = 0.1
 """Fraction of arcs whose length does not depend on the density."""
 POSITIONS = 8
@@ -81,7 +81,7 @@ class Arc:
         return self.c * dr.cos(t) + self.w * dr.sin(t)
 
     def weight(self, pdf: mi.Float, active: mi.Bool) -> mi.Float:
-        """Return the weight of a crossing in a direction that the BSDF samples with density ``pdf``."""
+        """Return the weight of an edge that crosses the arc in a direction with the BSDF sampling density ``pdf``."""
         if self.j is None:
             return dr.rcp(self.length * self.p)
         p = density_of_samples(pdf)

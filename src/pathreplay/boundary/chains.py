@@ -158,7 +158,7 @@ def record_chain(
     """Record the first ``k`` vertices of the chain along ``ray``.
 
     The ray ``at`` leads from the last of these vertices to an edge. Returns the recorded path, and the lanes in which
-    the chain has ``k`` vertices and a next arrival.
+    the chain passes all ``k`` vertices.
     """
     layout = Layout.of(trace, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)

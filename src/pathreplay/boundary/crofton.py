@@ -35,7 +35,7 @@ CRACK_BISECTIONS = 8
 """An end that stays fixed in this many successive bisections suggests a crack. At a true edge, this happens with a
 probability of 2^-7."""
 PARTS = 3
-"""Number of bisections in each half of a segment that locate the end of the part around the middle that differs."""
+"""Number of bisections with which `middle_fraction` locates each end of the part that differs from the ends."""
 MIN_FRACTION = 9 / 32
 """Fraction below which `middle_weight` is constant. It is halfway between two results of `middle_fraction`."""
 BEYOND = 1.5
@@ -181,12 +181,13 @@ def detect(probe: Probe, length: mi.Float, active: mi.Bool) -> mi.Float:
 
 
 def middle_weight(m: mi.Float) -> mi.Float:
-    """Return the weight of a segment whose ends are equal, if a middle part of relative length ``m`` differs.
+    """Return the weight of a segment that has equal probes at its ends and other probes on a part around its middle.
 
-    Consider shifts of the segment along its line, in units of its length. Over a range 1 - m of shifts, the segment
-    contains the differing part. Over a range min(m, 1 - m), this part also covers the middle, and is detected. The
-    weight is the ratio of the two ranges, which is unbounded for small m. Below `MIN_FRACTION`, the weight is therefore
-    constant. Its value gives the correct expectation at corners, where all m are equally likely.
+    The part has the fraction ``m`` of the segment's length. Suppose that the segment is shifted along its own line,
+    with shifts measured in units of its length. The segment contains the whole part over a range of shifts of size
+    1 - m. The part is detected only if it also contains the middle of the segment. This range has the size
+    min(m, 1 - m). The weight is the ratio of the two sizes, which is unbounded for small m. Below `MIN_FRACTION`, the
+    weight is therefore constant. Its value gives the correct expectation at corners, where all m are equally likely.
     """
     return dr.select(m < MIN_FRACTION, 2 / MIN_FRACTION - 1, dr.select(m < 0.5, (1 - m) / m, 1))
 

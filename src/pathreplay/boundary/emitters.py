@@ -40,7 +40,8 @@ from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import TraceConfig, mis_weight
 
 BORDER = 1e-4
-"""Margin of the unit square without segments: some emitters are singular there, for example the cone of a sphere."""
+"""Width of a margin of the unit square that segments do not enter: the samples of some emitters are singular there, for
+example in the cone of a sphere."""
 INSIDE = 1 - 2 * BORDER
 JUMP = 4.0
 """Largest ratio of the change of B over an interval to the change that the slope of B predicts. Above this ratio, the
@@ -271,7 +272,7 @@ class ShadowCrossing:
     def weighted(self, w: mi.Vector2f, u_lit: mi.Point2f) -> ShadowCrossing:
         """Replace the weight by the `crossing_weight`.
 
-        The weight so far is the jump along ``w``. ``u_lit`` is the end of the interval on the lit side.
+        Before the call, the weight is the jump in direction ``w``. ``u_lit`` is the lit end of the bisected interval.
         """
         observer, dark = self.segment.observer, self.dark
         at = observer.moved(observer.at.ray)

@@ -62,7 +62,7 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
 
 
 def radiance_of(importances: list[Importance]) -> mi.Float:
-    """Estimate the mean radiance along arcs: scattered light of emitter samples over scattering weight of arcs."""
+    """Estimate the mean radiance along arcs: scattered radiance of emitter samples divided by scattering weight."""
     from_emitters, total = (dr.sum(importance.light) for importance in importances)
     return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
 

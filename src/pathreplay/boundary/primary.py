@@ -10,8 +10,8 @@ over the film changes by the jump times the area that the edge sweeps. Short seg
 where B(s, π) = 0 on the edge, f_a and f_b are the radiances on its two sides, and w is the direction from a to b. The
 function B depends on the kind of edge:
 
-- outline: B = n·(o + t d - z), where z is the point of the nearer surface with fixed surface coordinates, o + t d is
-  the same point on the path, and n is perpendicular to edge and ray
+- outline: B = n·(o + t d - z), where the ray (o, d) of the path hits the nearer surface at distance t, z is the point
+  that was hit, with fixed surface coordinates, and n is perpendicular to edge and ray
 - contact of two surfaces: the difference of their distances
 - smooth-shaded mesh: the dot product of ray direction and shading normal; it vanishes slightly before the outline, and
   the mesh is black from there on

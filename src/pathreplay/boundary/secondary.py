@@ -41,7 +41,7 @@ refractions lie at other film positions."""
 
 @dataclass
 class CameraPath:
-    """A camera path to a vertex, which has two segments: one in the unit square of emitter samples, and one arc."""
+    """A camera path to a vertex, from which edges are searched on a segment in an emitter's square and on an arc."""
 
     s: mi.Point2f  # film position
     density: mi.Float  # density of ``s``, per pixel
@@ -51,7 +51,7 @@ class CameraPath:
 
 @dataclass(frozen=True)
 class SecondarySearch(EdgeSearch[CameraPath]):
-    """Edge search from path vertices, with segments of two ``lengths``: in the unit square, and on arcs (radians).
+    """Edge search from path vertices. ``lengths`` are the lengths of segments in the unit square and of arcs (radians).
 
     The search does not use the adjoint of the image, because forward mode has no adjoint and would select other
     segments.
