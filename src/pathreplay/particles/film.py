@@ -26,7 +26,7 @@ STEPS = 4096  # number of steps of the midpoint rule for the integral of the fil
 
 @dataclass
 class Footprint:
-    """The pixels that a contribution reaches: n x n pixels from a corner on, and the filter along both axes."""
+    """The n x n pixels that a contribution reaches: their lowest corner, and the filter's values along both axes."""
 
     corner: mi.Point2i
     x: list[mi.Float]
