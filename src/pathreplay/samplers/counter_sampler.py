@@ -10,8 +10,8 @@ import mitsuba as mi
 from pathreplay.samplers.streams import Stream
 
 STEPS = tuple(round(2**32 * (root % 1)) for root in ((1 + 5**0.5) / 2, 2**0.5))
-"""Steps of the Kronecker lattice. Both steps and 1 are linearly independent over the rationals, so that pairs of
-coordinates also fill the square evenly."""
+"""Steps of the Kronecker lattice: the fractional parts of the golden ratio and of √2, in units of 2^-32. These numbers
+and 1 are linearly independent over the rationals, so that pairs of coordinates also fill the square evenly."""
 ROUNDS = 8
 """Rounds of the TEA cipher. With Mitsuba's default of 4 rounds, samples of neighbouring keys are correlated, and
 shadows in two-bounce light were 4 % too weak."""
