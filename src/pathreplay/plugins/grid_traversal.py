@@ -22,9 +22,9 @@ from pathreplay.plugins.supergrid import Bounds
 
 T = TypeVar("T")
 
-#: Rate of residual collisions relative to the largest residual density. With 2 instead of 1, the exponent in the
-#: variance is half as large (see `control`). With 4, the additional collisions take more time than the lower noise
-#: saves (`pathreplay bench gridmedium`).
+#: Rate m of residual collisions, in units of the largest residual density. The variance is exp(x) - 1, where x is
+#: inversely proportional to m (see `control`). With a value of 4 instead of 2, the additional collisions take more time
+#: than the lower noise saves (`pathreplay bench gridmedium`).
 DENSER = 2.0
 #: Largest value of ∫ (σ - c)²/m ds over one cell, if σ is the lowest density of the cell along the whole ray. This
 #: integral approximates the relative variance that the cell adds to the transmittance (see `control`). A ray crosses 10
@@ -132,8 +132,8 @@ def begin(cells: Cells, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> CellWalk:
     offset = dr.select(still, dr.inf, (dr.select(forward, mi.Vector3f(1), mi.Vector3f(0)) - o) * inverse)
     inner = mi.Vector3f([n - 2 for n in cells.shape])
     start = dr.clip(dr.floor(dr.fma(d, a, o)), 1, inner)
-    # The traversal ends at the far side of the last inner cell at the latest. This distance is rounded as in the
-    # traversal.
+    # The traversal ends at the far side of the last inner cell at the latest. The distance to it is computed as in the
+    # traversal, so that both have the same rounding error.
     last = dr.fma(dr.select(forward, inner, mi.Vector3f(1)), inverse, offset)
     stride = dr.select(forward, mi.Vector3f(1), mi.Vector3f(-1))
     return CellWalk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))

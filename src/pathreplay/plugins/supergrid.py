@@ -4,8 +4,9 @@
 return. `coarser` merges 2 x 2 x 2 cells. `cheapest` selects a cell size between BASE³ voxels and the whole volume.
 
 `gridvolume` does not expose its filter and its wrap mode. The bounds are therefore valid for both filters and all wrap
-modes. A cell includes adjacent voxels and, beyond the faces of the grid, the values of every wrap mode. The bounds are
-also valid up to half a voxel beyond the faces of the cell, so that rounding in a traversal is harmless.
+modes. They include the voxels adjacent to a cell and, beyond the faces of the grid, the values that every wrap mode
+would return. They are also valid up to half a voxel beyond the faces of the cell, so that rounding in a traversal is
+harmless.
 
 Nothing here is differentiated.
 """
