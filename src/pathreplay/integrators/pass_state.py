@@ -40,5 +40,8 @@ class PassState:
         return replace(self, result=self.result + replace(result, image=None))
 
     def to_record(self) -> PassState:
-        """Return the state without ``passes``: a recorded pass cannot compare its own key with these keys."""
+        """Return the state as an input of a function that `dr.freeze` records, without ``passes``.
+
+        A recorded pass does not know its own key, and cannot check whether ``passes`` contains it.
+        """
         return replace(self, passes=frozenset())

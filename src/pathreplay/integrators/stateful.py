@@ -69,7 +69,7 @@ class StatefulIntegrator(Protocol):
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None: ...
 
     def options(self) -> Json:
-        """Return the properties of an equivalent `pathreplay`, without the properties of `PathIntegrator`."""
+        """Return the properties of an equivalent `pathreplay` integrator, except those of `PathIntegrator`."""
 
 
 @dataclass(frozen=True)

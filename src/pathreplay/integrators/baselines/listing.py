@@ -51,8 +51,8 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
         u, step = path.choose(trace, sampler)
         kept = step.kept
 
-        # All radiance along the ray has the weights of the flight's null collisions and of its real collision, if any,
-        # as factors.
+        # The weights of the flight's null collisions, and of its real collision if there is one, multiply all radiance
+        # along the ray.
         differentiate_flight(path.at, kept.media.flight, past, path.active, δL * L)
         L -= path.β * step.e
 

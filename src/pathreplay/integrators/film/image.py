@@ -73,7 +73,7 @@ def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int
     """Check that Dr.Jit can process all samples of a sensor in one kernel, and that memory suffices for its images.
 
     ``spp`` maps configuration keys to their samples per pixel; ``also`` is the number of further bytes that are needed.
-    Otherwise, raises PathreplayError. The message calls the sensor ``name`` and states the largest possible value.
+    Raises PathreplayError if one of the checks fails. The message calls the sensor ``name`` and states the remedy.
     """
     width, height = film_size(sensor)
     pixels = width * height

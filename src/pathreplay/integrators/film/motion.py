@@ -58,7 +58,7 @@ falls with the third power of this length, if the adjoint is smooth over the squ
 
 @dataclass
 class FlowPaths:
-    """Paths of the term, and the weights of their radiance under the flow."""
+    """The paths that the term traces: their pixels, their film positions and their weighted radiance."""
 
     pixel: mi.UInt32  # row-major index
     sample: Sample  # sample of the camera ray

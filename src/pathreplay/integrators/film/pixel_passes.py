@@ -1,4 +1,4 @@
-"""Inputs of a pixel sweep: its preconditions, the camera rays of each pixel, and the loss derivative of each pixel."""
+"""The adapter to `pixel_sweep`: checks of the sensor, and camera rays and loss derivative of each pixel."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class SurfaceFlow:
 
     sensor: mi.Sensor
     nodes: mi.Vector2f  # AD variables of value zero; their derivatives are the velocities at the grid nodes
-    flows: mi.Bool  # per cell, at the cell's first node: whether the velocity may be non-zero in or next to the cell
+    flows: mi.Bool  # whether the velocity may be non-zero in or next to a cell; indexed by the cell's first node
     is_all: bool = False
     samples: int = 5
 

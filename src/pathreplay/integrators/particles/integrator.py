@@ -35,9 +35,9 @@ def _few_rays(view: Pass) -> Pass:
 class ParticleIntegrator(PathReplayIntegrator):
     """Differentiable particle tracer for surfaces.
 
-    Light paths start at the emitters and are connected to the sensor at every vertex. Their number is the number of
-    pixels times the samples per pixel. Emitters that the sensor sees directly are rendered with camera rays. Their
-    number is limited to 2^20 in total or 16 per pixel, whichever is more.
+    Light paths start at the emitters and are connected to the sensor at every vertex. The number of light paths is the
+    number of pixels times the samples per pixel. Emitters that the sensor sees directly are rendered with camera rays.
+    The number of camera rays is limited to 2^20 in total or 16 per pixel, whichever is more.
 
     Properties: see `PARTICLES` in `integrators/properties.py`.
 

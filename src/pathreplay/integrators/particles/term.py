@@ -23,7 +23,7 @@ from pathreplay.transport.vertex import TraceConfig
 
 @dataclass(frozen=True)
 class ParticleTerm:
-    """Image and derivative of light paths. Their number is the number of samples of the pass.
+    """Image and derivative of light paths. A pass traces as many light paths as it has samples.
 
     Every path is differentiated as in `PathReplay`, and also with respect to its film positions. Not differentiated:
     the visibility of vertices from each other and from the sensor, and with a box filter the motion of film positions.
