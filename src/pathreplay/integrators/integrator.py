@@ -159,7 +159,7 @@ class PathReplayIntegrator(PathIntegrator):
     def _backward(
         self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None
     ) -> TermResult:
-        """Back-propagate through all terms. Raises `Unreached` only if no parameter reaches any camera or light path."""
+        """Back-propagate through all terms. Raises `Unreached` only if no parameter reaches camera or light paths."""
         if self.particles is None:
             return PathIntegrator._backward(self, terms, part, trace, grad_in, learned)
         unreached, results = [], []

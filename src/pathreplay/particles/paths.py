@@ -52,7 +52,7 @@ class Particles:
         return min(self.number, LANES_GPU if device_of(mi.variant()).is_gpu else LANES)
 
     def start(self, trace: TraceConfig, i: mi.UInt32) -> EmitterStart:
-        """Return the start of the light paths with indices ``i``; lanes with ``i`` of at least ``number`` are inactive."""
+        """Return the start of the light paths with indices ``i``; lanes with ``i`` >= ``number`` are inactive."""
         sampler = OwenSobolSampler.of(i, self.key)
         return EmitterStart(trace, self.emission, EmitterSamples.draw(sampler), sampler, i < self.number)
 
