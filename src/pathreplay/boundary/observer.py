@@ -125,7 +125,7 @@ class ObserverVertex:
             # With a given flight, no random numbers are needed, and the sampler may be None.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # creases cross constant directions
+        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # where True, creases are edges
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
         """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium: see `fly_again`."""

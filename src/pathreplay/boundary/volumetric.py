@@ -120,7 +120,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         return skip_null(self.trace, ray, meet(self.trace, ray, active), active)
 
     def _reach(self, ray: mi.Ray3f) -> mi.Float:
-        """Return the largest τ that is sampled on a ray: the hit or, on a miss, the far side of the bounding sphere."""
+        """Return the largest τ that is sampled on a ray: at its hit or, on a miss, behind the whole scene."""
         hit, box = self._hit(ray, mi.Bool(True)), self.trace.scene.bbox()
         far = dr.norm(ray.o - box.center()) + 0.5 * dr.norm(box.extents())
         return dr.select(hit.is_valid(), hit.t, far)
