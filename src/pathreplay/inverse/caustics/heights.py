@@ -1,4 +1,4 @@
-"""Initial height map for the design of a caustic: a lens or mirror whose caustic is an image, by optimal transport.
+"""Initial height maps of lenses and mirrors that cast a given image as their caustic, computed by optimal transport.
 
 Gradients of renderings change a caustic locally, and end in local minima if light has to travel far across the image.
 The initial height map therefore transports the light first, as in Schwartzburg et al. (2014) and Sun et al. (2024):
@@ -9,7 +9,8 @@ The initial height map therefore transports the light first, as in Schwartzburg 
    and the slopes that belong to the normals.
 
 For small slopes, the shift of the light on the receiver is proportional to the slope. The transport then minimises the
-mean square slope. Its map is a gradient, so the slopes of step 2 are nearly the gradient of a height map.
+mean square slope. The optimal T is the gradient of a potential, so the slopes of step 2 are nearly the gradient of a
+height map.
 
 The normals of step 2 depend on the heights, so steps 2 and 3 are repeated. Fresnel reflection is ignored.
 """

@@ -34,7 +34,7 @@ Newton's method often fails where dark pixels are next to bright pixels."""
 _SHRINKAGE, _SHORTEST = 0.6, 1e-4
 """Factor by which a step is shortened until v is convex, and the shortest step relative to Newton's."""
 _LEAST_DETERMINANT = 0.1
-"""Least determinant after a step, relative to the smaller of the determinant before it and g."""
+"""Lower bound on det D²v after a step, as a fraction of the smaller of two values: g, and det D²v before the step."""
 
 
 def potential(density: Field, initial: Field | None = None, width: float = 1.0) -> Field:

@@ -41,7 +41,8 @@ class Optimizer(Table):
     """Number of corrections that L-BFGS-B keeps."""
     tolerance: Positive | None = None
     """Stopping threshold as a fraction of the initial loss. L-BFGS-B stops when a step lowers the loss by less than
-    this. Levenberg-Marquardt stops when the noise of the values raises the loss by less than this (default: never)."""
+    this. Levenberg-Marquardt stops when the remaining noise of the recovered values raises the loss by less than this
+    (default: never)."""
     damping: Positive | None = None
     """Initial damping of Levenberg-Marquardt, relative to the diagonal of the Gauss-Newton matrix."""
 
@@ -59,7 +60,10 @@ class Optimizer(Table):
 
     @property
     def searches(self) -> bool:
-        """Whether the optimiser compares losses of different iterations. These use the same random numbers."""
+        """Whether the optimiser compares losses of different iterations.
+
+        All iterations of such an optimiser use the same random numbers, so that their losses are comparable.
+        """
         return self.type in ("l-bfgs-b", "levenberg-marquardt")
 
     @property

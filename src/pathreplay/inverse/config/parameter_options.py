@@ -57,7 +57,7 @@ class Displacement(Table):
 
 
 class TransportStart(Table):
-    """A height map whose caustic is an image, by optimal transport (`pathreplay.caustic_heights`)."""
+    """Initial height map that casts a given image as its caustic, computed by `pathreplay.caustic_heights`."""
 
     transport: str
     """Image file, or 'matplotlib:NAME' for a sample image of matplotlib; it is converted to grey."""
@@ -229,8 +229,8 @@ class Displace(Table):
     interpolation: Literal["linear", "cubic"] = "linear"
     """Interpolation of the height maps: linear, or by cubic B-splines, whose slopes and curvatures are continuous."""
     weights: str | Annotated[list[str], Field(min_length=1)] | None = None
-    """Attribute of the mesh that contains a factor on the heights per vertex, such as 'vertex_weight'. With several
-    height maps, a list of one attribute per map. Default: 1 everywhere."""
+    """Attribute of the mesh, such as 'vertex_weight', that contains one number per vertex. The height at each vertex is
+    multiplied by this number. With several height maps, a list of one attribute per map. Default: 1 everywhere."""
 
 
 class Derivation(Table):

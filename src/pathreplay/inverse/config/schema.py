@@ -76,7 +76,8 @@ class Config(Table):
     loss: str = "l2"
     """Name of a loss, or module:function."""
     debias: Switch = False
-    """Also evaluate a smooth loss at each half of the samples, and remove the bias due to noise to first order."""
+    """Remove, to first order, the bias of a smooth loss due to noise. The loss is also evaluated at the images of two
+    halves of the samples."""
     iterations: Count = 200
     """Number of iterations."""
     spp: Spp = 16

@@ -96,7 +96,10 @@ def _mask(photo: Photo, masks: Path) -> Path:
 
 
 def _names(files: list[str]) -> list[str]:
-    """Make unique names, valid for sensors and files, from the file names or, if these are ambiguous, the paths."""
+    """Make a unique name for each image, which is valid as the name of a sensor and of a file.
+
+    The names are the stems of the file names, or the paths if two images have the same stem.
+    """
     names = [Path(file).stem for file in files]
     if len(set(names)) < len(names):
         names = [str(Path(file).with_suffix("")) for file in files]

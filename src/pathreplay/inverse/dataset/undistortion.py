@@ -23,9 +23,9 @@ from pathreplay.inverse.images.io import Image
 Plane = NDArray[np.float64]
 
 OFF = 0.5
-"""Tolerance on square pixels: largest displacement in pixels, at the image border, if fy is replaced by fx."""
+"""Tolerance in pixels. Pixels count as square if replacing fy by fx moves the image border by at most this distance."""
 _STEPS = 2048
-"""Number of radii at which the monotonicity of a lens is tested."""
+"""Number of radii at which `Lens.bent` tests whether the distorted radius still increases."""
 
 
 @dataclass(frozen=True)

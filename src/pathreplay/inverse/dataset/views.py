@@ -101,7 +101,11 @@ def shares_of(
 
 
 def named_views(scene: mi.Scene, sensors: dict[str, int], wanted: Sequence[int | str], key: str) -> list[str]:
-    """Return the views of sensors that a key of the job names. Raises PathreplayError if a sensor has no view."""
+    """Return the names of the views that belong to sensors given by id, name or index.
+
+    ``wanted`` contains the sensors, and ``key`` is the key of the job that lists them, for messages. Raises
+    PathreplayError if a sensor has no view.
+    """
     available, ids = list(sensors_of(scene, None)), [sensor.id() for sensor in scene.sensors()]
     names = {index: name for name, index in sensors.items()}
     indices = [_place(item, ids, available) for item in wanted]

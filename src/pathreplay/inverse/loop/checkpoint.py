@@ -51,9 +51,9 @@ class Entry:
     dropped_shares: dict[str, float] = field(default_factory=dict)
     """Fraction of NaN or infinite entries in the gradients of each variable, over all views."""
     slopes: dict[str, list[float]] = field(default_factory=dict)
-    """Sums of each gradient over parts of its variable (see `movement`)."""
+    """Sums of each gradient over contiguous parts of its variable (see `movement.parts_of`)."""
     means: dict[str, list[float]] = field(default_factory=dict)
-    """Means of the values over parts of each variable, after the step (see `movement`)."""
+    """Means of each variable over the same parts, after the step."""
 
 
 @dataclass
@@ -65,7 +65,7 @@ class Run:
     values: dict[str, Array]
     """Decoded values of the variables, by key."""
     learned: Arrays = field(default_factory=dict)
-    """State that evaluations pass on to later evaluations, by name, such as the control variates of media."""
+    """Arrays, by name, that the integrator passes on to later evaluations, such as the control variates of media."""
     history: list[Entry] = field(default_factory=list)
     baseline: Run | None = None
     """A run of another integrator for comparison, with the same initial values and the same computation time."""

@@ -27,16 +27,16 @@ from pathreplay.inverse.problem.problem import Problem
 FEW = 4
 """Maximum number of entries of a variable that are perturbed one by one. Larger variables are scaled as a whole."""
 MOST_COLUMNS, MOST_PIXELS, MOST_ROWS = 16, 2**23, 2**20
-"""Limits on the columns of J, the pixels of all views, and the rows of J. If J has k times as many rows or more, only
-every k-th row is used."""
+"""Limits on the columns of J, the pixels of all views, and the rows of J. If J has k times `MOST_ROWS` rows or
+more, only every k-th row is used."""
 MOST_SAMPLES, FREE_SAMPLES, SHARE = 16, 2**22, 0.1
 """`MOST_SAMPLES` is the maximum number of samples per pixel. The total number of samples is limited to `FREE_SAMPLES`,
 or to the fraction `SHARE` of the run's samples if that is more."""
 STEP = 0.01
 """Size of a perturbation relative to the sum of three numbers: value, change during the run, and learning rate."""
 UNDONE = 0.05
-"""Two parameters are a trade-off if the sine of their angle is below this value. The sine is the fraction of a change
-of the images by one parameter that the other parameter cannot undo."""
+"""Two parameters are a trade-off if the sine of their angle is below this value. If one parameter changes the images,
+the sine is the fraction of this change that the other parameter cannot undo."""
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Columns of the Jacobian by variable, shape (pixels, entries)."""

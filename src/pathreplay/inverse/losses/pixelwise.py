@@ -3,10 +3,10 @@
 A loss f(I, T) compares the rendered image I with the target T. The optimiser minimises the weighted mean of f over
 pixels and channels.
 
-The image at which the derivative f' is evaluated, and the derivative of I, use independent samples (see `frozen`). The
-gradient is therefore unbiased if f' is linear in I, as for ``l2`` and ``relative-l2``. Noise in I biases the gradients
-of the other losses, and more samples per pixel reduce the bias. These losses are useful where outliers would dominate
-``l2``. Losses that couple pixels are in `image_losses`.
+The gradient is the product of f'(I, T) and the derivative of I, which are estimated from independent samples (see
+`frozen`). It is therefore unbiased if f' is linear in I, as for ``l2`` and ``relative-l2``. Noise in I biases the
+gradients of the other losses, and more samples per pixel reduce the bias. These losses are useful where outliers would
+dominate ``l2``. Losses that couple pixels are in `image_losses`.
 """
 
 from __future__ import annotations

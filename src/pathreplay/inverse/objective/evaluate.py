@@ -180,7 +180,7 @@ def owned_tensor(picture: Array) -> mi.TensorXf:
 
 
 class Evaluator:
-    """Evaluates shards of a problem with one integrator. The scene keeps the values of the last shard.
+    """Evaluates shards of a problem with one integrator. After a call, the scene contains the values of the shard.
 
     Only the variables ``moving`` (default: all) are differentiated. Views are rendered and back-propagated one by one,
     which limits memory to the AD graph of a single view.
@@ -201,10 +201,10 @@ class Evaluator:
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(self.integrator, has_media) and problem.loss not in ELSEWHERE
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # Keys: samples per pixel.
-        # Whether a pixel sweep is possible. Keys: view, samples per pixel, and whether pixels are batched.
+        # Whether one pass computes image and gradient. Keys: view, samples per pixel, and whether pixels are batched.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
         self._learned: Arrays = {}  # State of the integrator after the last evaluation.
-        self._at: object = None  # The integrator's object for this state, which another evaluator may have replaced.
+        self._at: object = None  # `integrator.baseline` then; another evaluator may replace it in the integrator.
         self._begun = False
         self._jacobians: Jacobians | None = None
 
@@ -270,7 +270,7 @@ class Evaluator:
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
-        # One bad path must not end a long run. Only finite entries have a finite sum, which needs no temporary array.
+        # One bad path must not end a long run. A sum is finite only if all entries are, and needs no temporary array.
         broken = [key for key, gradient in gradients.items() if not np.isfinite(gradient.sum(dtype=np.float64))]
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:

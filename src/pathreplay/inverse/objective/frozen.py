@@ -60,7 +60,7 @@ class RenderRequest:
     seed: int | mi.UInt32
     spp: int
     batch: Batch | None = None
-    """Pixels to render, in the order of the target's rows; None renders all. A batch requires ``ViewLoss.swept``."""
+    """Pixels to render, one for each row of the target; None renders all. A batch requires ``ViewLoss.swept``."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class ViewLoss:
     loss: Loss
     share: float
     swept: bool
-    """Whether image and gradient come from one pixel sweep, which requires a quadratic loss."""
+    """Whether one pass computes image and gradient, which requires a quadratic loss."""
     debias: bool = False
     """Whether the bias due to noise is removed to first order: see `_extrapolated`."""
 

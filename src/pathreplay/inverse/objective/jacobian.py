@@ -22,11 +22,13 @@ from pathreplay.inverse.problem.problem import Problem, scene_values
 from pathreplay.platform import memory
 
 IMAGE = ""
-"""Key of the image itself. All other keys are keys of variables, and stand for derivatives."""
+"""Key by which `Jacobians` requests the image. The key of a variable requests a derivative with respect to it."""
 
 
 class Jacobians:
-    """Differentiates the images of a problem with respect to the variables ``moving``. The scene keeps their values.
+    """Differentiates the images of a problem with respect to the variables ``moving``.
+
+    Between calls, the scene contains the values of the last call.
 
     Args:
         problem: the problem, with a quadratic loss.
@@ -45,13 +47,17 @@ class Jacobians:
     def model(
         self, values: Arrays, view: int, seed: int, spp: int
     ) -> tuple[float, dict[str, Array], dict[str, int], GaussNewton]:
-        """Compute the view's contribution to the loss, its gradients, dropped entries, and the Gauss-Newton model.
+        """Compute the contribution of a view to the loss, with gradients and the Gauss-Newton model.
 
         Args:
             values: values of all variables.
             view: index of the view.
             seed: seed of the view.
             spp: samples per pixel of both halves together.
+
+        Returns:
+            The loss, the gradients by key, the number of entries with NaN or infinite derivatives by key, and the
+            model. NaN and infinite derivatives count as zero.
 
         Raises:
             NotRecordable: a plugin of the scene prevents Dr.Jit from recording a pass.

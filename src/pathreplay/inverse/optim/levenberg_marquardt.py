@@ -50,13 +50,14 @@ FLAT = 1e-8
 """Ratio of an eigenvalue of H, scaled to unit diagonal, to the largest eigenvalue. Below this ratio, the loss counts as
 constant along the eigenvector."""
 LARGEST = 4.0
-"""Upper limit of the eigenvalues of H relative to the robust matrix. Noise lowers the robust matrix by less than this
+"""Upper limit of the eigenvalues of H relative to `GaussNewton.robust`. Noise lowers that matrix by less than this
 factor, so larger eigenvalues are due to outliers."""
 SIGNAL = 1e-3
-"""Ratio of the diagonals of the robust matrix and the bias (see `GaussNewton`), below which an entry does not move."""
+"""Ratio of the diagonals of `GaussNewton.robust` and `GaussNewton.bias`, below which an entry does not move."""
 EFFECT = 10.0
-"""Upper limit of ½ δᵀ(R + B)δ relative to the loss, with the robust matrix R and the bias B: the squared change of the
-mean image that a step δ predicts. For Gauss-Newton steps, it exceeds 1 only due to outliers of the gradient."""
+"""Upper limit of ½ δᵀ(R + B)δ relative to the loss, with R = `GaussNewton.robust` and B = `GaussNewton.bias`. This is
+the predicted squared change of the mean image by a step δ. Gauss-Newton steps exceed a ratio of 1 only if the gradient
+has outliers."""
 ROUNDING = 1e-6
 """Relative error of losses in single precision."""
 
@@ -311,7 +312,7 @@ class LevenbergMarquardt:
 
 
 def _positive(model: GaussNewton) -> Matrix:
-    """Return H with its eigenvalues relative to the robust matrix clipped to an interval.
+    """Clip the eigenvalues of H relative to `GaussNewton.robust` to an interval, and return the resulting matrix.
 
     The lower limit is the relative noise of H, estimated from its diagonal. The upper limit is `LARGEST`, which bounds
     the effect of outliers.
@@ -328,6 +329,6 @@ def _positive(model: GaussNewton) -> Matrix:
 
 
 def _scale(model: GaussNewton) -> Matrix:
-    """Return the diagonal of the robust matrix, with zeros for entries whose derivatives are mere noise."""
+    """Return the diagonal of `GaussNewton.robust`, with zeros for entries that do not move (see `SIGNAL`)."""
     diagonal, noise = np.diag(model.robust), np.diag(model.bias)
     return np.where(diagonal > SIGNAL * noise, diagonal, 0)

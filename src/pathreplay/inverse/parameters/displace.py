@@ -24,7 +24,7 @@ from pathreplay.scenes.parameters import get_array
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Function of the positions p₀ and a height map that returns displaced positions (3 n floats, as Mitsuba stores).
+    """Function of the positions p₀ and a height map that returns displaced positions, flat with 3 n floats.
 
     Vertices with equal positions p₀ have the same direction and move by the mean of their displacements. A watertight
     mesh therefore stays watertight, although files duplicate vertices at creases and seams of texture coordinates.

@@ -92,7 +92,7 @@ class Problem:
     params: mi.SceneParameters
     integrator: mi.Integrator
     baseline: mi.Integrator | None
-    """Integrator of a second run, which solves the same problem in the same time for comparison; None without it."""
+    """Integrator of a second run, which solves the same problem in the same time for comparison, or None."""
     judge: mi.Integrator
     """Integrator that renders images for comparing the results of ``integrator`` and ``baseline`` with the targets.
 
