@@ -119,9 +119,10 @@ def by_key(parameters: Mapping[str, Parameter | None] | Sequence[str] | str) -> 
 
 
 class Objects:
-    """Functions and arrays of a problem, by the names that represent them in the tables of a job.
+    """Functions and arrays in memory, which the tables of a job cannot contain.
 
-    ``starts`` are initial values by parameter key.
+    ``functions`` are indexed by the names that stand for them in the tables. ``starts`` are initial values by parameter
+    key.
     """
 
     def __init__(self) -> None:

@@ -127,8 +127,8 @@ def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
     config = problem.config
     held = {v.key for v in problem.variables} if config.stages else set()  # stages may freeze any of these variables
     before = go_on(folder.path, problem, run, held)
-    # A run with all its iterations is resumed too if it has no report. Its results could not be written, for example
-    # because the disk was full, and are written now.
+    # A run that has taken all its iterations can still lack a report, for example because the disk was full. It is
+    # resumed only to write its results.
     if not (folder.path / "report.html").exists():
         return before
     name = f"Run {folder.name}"

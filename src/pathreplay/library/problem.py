@@ -31,7 +31,7 @@ from pathreplay.scenes.loading import load_scene_for
 from pathreplay.types import Json
 
 MOST_ITERATIONS = 10**6
-"""``iterations`` of a problem that is not part of a run, large enough for any ``refine_at``."""
+"""Number of iterations in the config of a problem that does not define it. Every ``refine_at`` must be below it."""
 OF_A_PROBLEM = frozenset(
     "scene scene_parameters sensors test_views variant integrator baseline parameters derived capture exposure "
     "view_weights target loss learning_rate deterministic memory_limit".split()
@@ -47,9 +47,10 @@ class Problem:
     differentiated.
 
     Args:
-        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. A loaded scene is
-            used unchanged. In any other scene, `dielectric_ad` replaces each ``dielectric`` if an index of refraction
-            is a parameter. 8-bit textures that are parameters are loaded as floating-point numbers.
+        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. A `mi.Scene` is
+            used unchanged. Scenes of the other kinds are loaded such that ``parameters`` are differentiable: if an
+            index of refraction is a parameter, `dielectric_ad` replaces each ``dielectric``, and 8-bit textures that
+            are parameters are stored as floating-point numbers.
         parameters: options by parameter key of ``mi.traverse(scene)`` or glob, or a sequence of keys without options.
         views: sensors and their targets.
         loss: a name (see `pathreplay.losses`), or ``loss(image, target)`` on tensors of shape (height, width, channels)

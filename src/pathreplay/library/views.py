@@ -1,4 +1,4 @@
-"""Converts views to sensor names, and their targets and weights to arrays, which are checked against the films."""
+"""Finds the sensors of views, and converts targets and weights to arrays that fit the films of these sensors."""
 
 from __future__ import annotations
 
