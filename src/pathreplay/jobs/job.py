@@ -52,8 +52,8 @@ def optimize(
         with iterate(
             config, resume=resume, output=output, progress=progress, define=define, executor=executor
         ) as session:
-            # One change of the thread pool instead of one per iteration: when Dr.Jit 1.5 removes a thread at the moment
-            # at which the thread goes to sleep, it misses the wake-up call and the process waits forever.
+            # Change the thread pool once instead of once per iteration. If Dr.Jit 1.5 removes a thread at the moment at
+            # which the thread goes to sleep, the thread misses the wake-up call, and the process waits forever.
             with one_thread(session.deterministic):
                 for _ in session:
                     pass

@@ -29,9 +29,9 @@ class Optimization:
 
     The scene is loaded when the first iteration is requested. At the end of the loop, all results are written and
     ``result`` is set. `stop` ends the run early and also writes all results. `close` ends the run and writes a
-    checkpoint to resume from, but no results. Leaving a ``with`` block has the same effect as `close`. So has the
-    deletion of the object, for example after a loop that was left early. `pathreplay.optimize` describes the effect of
-    signals.
+    checkpoint to resume from, but no results. Leaving a ``with`` block calls `close`. If the object is deleted, for
+    example after a loop that was left early, the run also ends with a checkpoint. `pathreplay.optimize` describes the
+    effect of signals.
     """
 
     def __init__(self, job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> None:
