@@ -13,7 +13,7 @@ from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.report.outcome import Recovered, RecoveredPose
 from pathreplay.report.pages.page import Plot, Row, Series, thinned
 
-# Maximum number of pixels from which the common exposure is computed. More pixels do not change the exposure.
+# Approximate number of pixels from which the common exposure is computed, which suffices for an accurate exposure.
 MOST_LEVELS = 1_000_000
 
 THINNED = "Of {} iterations, every {}th is drawn."

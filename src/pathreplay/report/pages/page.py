@@ -72,7 +72,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Mesh:
-    """An interactive mesh: vertices by kind (3n float32, base64), and vertex indices of faces (3m uint32, base64)."""
+    """An interactive mesh with n vertices and m faces, whose arrays are encoded in base64.
+
+    ``vertices`` contains the positions (3n float32) of each version of the mesh: 'start', 'result' and 'truth', if
+    known. ``faces`` contains vertex indices (3m uint32).
+    """
 
     vertices: dict[str, str]
     faces: str
