@@ -32,7 +32,7 @@ from pathreplay.platform.interrupts import undisturbed
 OLDEST = (2, 60)
 """First version of Ray whose token authentication covers clusters that a program starts."""
 
-# With the value 0, Ray uses only loopback addresses. The variable is meant for systems whose firewalls block clusters.
+# If this variable is 0, Ray uses only loopback addresses. Ray provides it for systems whose firewalls block clusters.
 _MANY_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _MODE, _TOKEN, _ADDRESS = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"
 _LONGEST_FOLDER = 20

@@ -36,10 +36,10 @@ SMALL = 2**16
 """Bytes. Smaller arrays are sent with each request, which is faster than fetching them from the object store."""
 
 SOON_S = 60.0
-"""Seconds after which a line is logged if no actor is ready. Loading Mitsuba and a scene takes some time."""
+"""Seconds to wait for the first ready actor before a line is logged. Actors load Mitsuba and the scene meanwhile."""
 
 LOOK_S, AGAIN_S = 0.1, 1.0
-"""Seconds without an answer after which the processes of the cluster, and its head node, are checked."""
+"""While no answer arrives: seconds between checks of the cluster's processes, and between checks of its head node."""
 
 Reference = Hashable
 """Ray's reference to an answer, or to arrays in its object store."""
