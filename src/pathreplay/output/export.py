@@ -41,8 +41,9 @@ def export_run(run: Path, output: Path | None = None) -> str:
     """Export the scene of a run with its final values.
 
     The folder contains `scene.xml` and the files that it references (textures as EXR, grids as `.vol`, meshes as PLY).
-    Recovered textures and meshes are also written as PNG and OBJ, cameras as `transforms.json`, small values to
-    `values.json`, and large values outside the scene as NPY. The function activates the variant of the run.
+    Recovered textures and meshes are also written as PNG and OBJ, cameras as `transforms.json`, and small values to
+    `values.json`. Large parameters that are not part of the scene are written as NPY. The function activates the
+    variant of the run.
 
     Args:
         run: run folder.

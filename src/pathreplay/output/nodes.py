@@ -165,7 +165,7 @@ def _deepest(described: Described, owner: Owner) -> Owner:
 
 
 def require_no_objects(described: Described) -> None:
-    """Raise PathreplayError if an object was instantiated before parsing, because its description is unknown."""
+    """Raise PathreplayError if the description contains a loaded object, whose own description is unknown."""
     for node in described.nodes:
         for name in node.props.keys():
             kind = node.props.type(name)

@@ -20,7 +20,7 @@ from pathreplay.inverse.images.io import Image, png_bytes
 from pathreplay.platform import memory
 from pathreplay.scenes.descriptions import errors_as
 
-# Samples per pass of the `independent` sampler. Passes take a few seconds, so that bar and Ctrl-C respond soon.
+# Samples per pass of the `independent` sampler. Passes take a few seconds, so that Ctrl-C takes effect soon.
 _A_PASS = 2**24
 # Bytes per sample during a pass, for two copies of the state of its random number generator.
 _A_SAMPLE = 64
@@ -132,7 +132,7 @@ def render(
     names = tuple(field.name for field in sensor.film().bitmap().struct_())
     picture = (total / done).astype(np.float32)
     picture = picture[:, :, None] if picture.ndim == 2 else picture
-    # The film lists colours before AOVs. If the integrator returns only AOVs, these have the last names.
+    # The film lists names of colours before names of AOVs. An image that has only AOVs has fewer channels than names.
     return Rendering(picture, names[len(names) - picture.shape[2] :], done)
 
 

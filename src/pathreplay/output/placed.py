@@ -27,7 +27,7 @@ _ALSO_PLACES = {
 }
 """Properties by plugin whose effect `mi.traverse` includes in `to_world`. An exported `to_world` replaces them."""
 
-# Materials and emitters of existing mesh objects that can be exported: class, plugin, and all properties of the plugin.
+# Materials and emitters of `mi.Mesh` objects that can be exported. Class name -> plugin, and all properties to export.
 _KNOWN: dict[str, tuple[str, tuple[str, ...]]] = {
     "SmoothDiffuse": ("diffuse", ("reflectance",)),
     "SmoothConductor": ("conductor", ("eta", "k", "specular_reflectance")),
@@ -66,7 +66,7 @@ class Placing:
             self._number(key, node, place)
 
     def meshes(self) -> None:
-        """Write existing mesh objects to files, and describe the meshes, their materials and emitters by properties."""
+        """Write each `mi.Mesh` of the description to a file, and describe its material and emitter by properties."""
         for parent in list(self.described.nodes):
             for name in list(parent.props.keys()):
                 value = parent.props.get(name) if parent.props.type(name) == mi.Properties.Type.Object else None
@@ -130,10 +130,10 @@ class Placing:
         parent.props[name] = self.described.add(properties, mi.ObjectType.Shape)
 
     def _known(self, instance: mi.Object, what: str) -> mi.Properties:
-        """Describe an existing material or emitter by properties.
+        """Describe a loaded material or emitter by properties.
 
-        Raises PathreplayError unless the object is a diffuse material, a conductor or an area light, of constant
-        colours, or glass.
+        Supported objects are glass, and diffuse materials, conductors and area lights of constant colour. Raises
+        PathreplayError for all other objects.
         """
         params = mi.traverse(instance)
         if instance.class_name() == "SmoothDielectric" and params.keys() == {"eta"}:
