@@ -15,7 +15,7 @@ COSTS: dict[str, Callable[[int], int]] = {
     "texture": lambda n: 64 * n**2,  # per texel: three numbers, with copies in double precision
     "grid": lambda n: 256 * n**3,  # per voxel: the 12 waves of the noise, all in memory at once
     "views": lambda n: 100_000 * n,  # per view: a sensor with its film
-    "columns": lambda n: 1000 * n**2,  # per vertex, with its faces; rows are about as many
+    "columns": lambda n: 1000 * n**2,  # per vertex, with its faces, for about as many rows as columns
     "rows": lambda n: 1000 * n**2,
     "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # eight faces, each split into four n times
 }
@@ -99,8 +99,9 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
 
     ``front`` looks straight through the pane. ``left`` and ``right`` look at an angle of 55 degrees, where the
     thickness shifts the view and the front reflects more of the room. These views separate the effect of the index from
-    the effect of the slope of the surface. The keys are ``glass.eta`` and ``front_face.bsdf.normalmap.data``. The
-    normal map covers the middle of the pane, and contains ``texture``² normals, stored as (n + 1) / 2.
+    the effect of the slope of the surface. The key of the index is ``glass.eta``, and the key of the normal map is
+    ``front_face.bsdf.normalmap.data``. The normal map covers the middle of the pane, and contains ``texture``² normals,
+    stored as (n + 1) / 2.
     """
     T = mi.ScalarTransform4f
     # The pane is so wide that no path sees the rim, and its corners are inside the room.
@@ -151,7 +152,7 @@ def mirror_camera(resolution: int = 48) -> SceneDict:
     """Describe an old mirror with blotches in a textured room, seen by a fixed camera and by a camera that may move.
 
     Both cameras see the mirror and a part of the room around it. The blotches make the image depend on the mirror's
-    position in its plane. The keys are ``camera.to_world`` and ``mirror.to_world``.
+    position in its plane. The keys of their poses are ``camera.to_world`` and ``mirror.to_world``.
     """
     place = mi.ScalarTransform4f().translate([-0.4, -0.1, -1.0])
     blotches = _picture(_blotches(32))
@@ -276,8 +277,8 @@ def _panel(place: mi.ScalarTransform4f, *colour: float) -> SceneDict:
 def flat_colours(resolution: int = 32) -> SceneDict:
     """Describe emissive panels of one colour each, at different distances before a black background.
 
-    Each panel has uniform radiance, so small motions change an image only at edges. The camera (key
-    ``camera.to_world``) looks at the panels from a distance of 3.
+    Each panel has uniform radiance, so small motions change an image only at edges. The camera looks at
+    the panels from a distance of 3. The key of its pose is ``camera.to_world``.
     """
 
     def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> mi.ScalarTransform4f:
@@ -297,7 +298,8 @@ def flat_colours(resolution: int = 32) -> SceneDict:
 def glass_ball(resolution: int = 32) -> SceneDict:
     """Describe a glass sphere (index 1.5, radius 0.5) in front of panels of one colour each.
 
-    The sphere is visible only because it refracts and reflects light. The keys are ``glass.eta`` and ``ball.to_world``.
+    The sphere is visible only because it refracts and reflects light. The key of its index is ``glass.eta``, and the key
+    of its pose is ``ball.to_world``.
     """
 
     def at(x: float, y: float, z: float, width: float, height: float) -> mi.ScalarTransform4f:

@@ -34,13 +34,14 @@ def caustic_lens(  # noqa: PLR0913 (keywords of a job)
 
     The slab has the width 1 and the thickness 0.2. Its exit surface is in the plane z = 0. `slab` creates it for a
     height map of ``rows`` x ``columns``. The receiver is at z = ``distance``. Collimated light falls perpendicularly on
-    the whole entry surface. With ``source_distance``, a point light at this distance from the entry surface replaces
-    it, and a black frame blocks the light that would miss the exit surface. ``irradiance`` is the irradiance at the
-    centre of the entry surface.
+    the whole entry surface. With ``source_distance``, the light comes from a point at this distance from the entry
+    surface, and a black frame blocks the light that would miss the exit surface. ``irradiance`` is the irradiance at
+    the centre of the entry surface.
 
     The camera sees a part of the receiver of width ``receiver_width``, with x to the right and y down. It is halfway
-    between slab and receiver, and casts no shadow. The key is ``lens.vertex_positions``. The attributes of the mesh for
-    displacements are ``vertex_weight`` and, with ``two_surfaces``, ``vertex_entry_weight``.
+    between slab and receiver, and casts no shadow. The key of the slab's vertices is ``lens.vertex_positions``. The
+    mesh attribute ``vertex_weight`` selects the vertices of the exit surface for displacements. With ``two_surfaces``,
+    ``vertex_entry_weight`` selects the vertices of the entry surface.
     """
     high = rows / columns
     glass = {"type": "dielectric", "int_ior": eta, "ext_ior": 1.0}
@@ -73,8 +74,8 @@ def caustic_mirror(
     perpendicular to the light, at the centre of the mirror. The receiver is parallel to the mirror at z = ``distance``.
     Its centre is the point to which a flat mirror reflects the light that arrives at the centre of the mirror.
 
-    The camera sees a part of the receiver of width ``receiver_width``, with x to the right and y down. The key is
-    ``mirror.vertex_positions``.
+    The camera sees a part of the receiver of width ``receiver_width``, with x to the right and y down. The key of
+    the mirror's vertices is ``mirror.vertex_positions``.
     """
     if not 10 <= angle <= 80:
         raise PathreplayError(f"The angle of the mirror is {angle:g}; give 10 to 80 degrees, so that nothing is shaded")
@@ -113,7 +114,7 @@ def _observed(resolution: int, high: float, distance: float, receiver_width: flo
 
 
 def _half(rows: int, columns: int) -> Array:
-    """Return half the width and height of a surface whose map has width 1. It ends half a cell inside the map."""
+    """Return half the width and height of a surface whose map has width 1. The surface ends half a cell before the map."""
     return np.array([columns - 1, rows - 1]) / columns * _WIDTH / 2
 
 

@@ -7,9 +7,9 @@ parameter                     stored by Mitsuba                       decoded va
                               equal to the column of the other end;   channel
                               in mono variants three equal channels
 textures of 16 bits           half precision                          single precision
-colours in spectral variants  coefficients of a smooth spectrum S,    S at three wavelengths, red, green and blue,
-                              see `spectra`; for                      multiplied by the factor where there is one
-                              some with a factor                      (environment maps, volumes)
+colours in spectral variants  coefficients of a smooth spectrum S     S at a red, a green and a blue wavelength; in
+                              (see `spectra`); in environment maps    environment maps and volumes, the factor times S
+                              and volumes also a factor of S
 ============================  ======================================  =================================================
 
 Jobs optimise, save and compare decoded values. Bounds, learning rates and resolutions refer to decoded values.
@@ -32,7 +32,8 @@ from pathreplay.scenes.spectra import TO_COEFFICIENTS, WAVELENGTHS, coefficient_
 
 Array = NDArray[np.float32]
 
-# S is clipped to [_MARGIN, 1 - _MARGIN] before p is computed from S, because p is infinite at S = 0 and S = 1.
+# Distance that `Spectra.store` keeps from the limits 0 and 1 of a spectrum S, where the polynomial p is infinite (see
+# `spectra`).
 _MARGIN = 1e-4
 
 
