@@ -41,7 +41,7 @@ def file_problem(path: str | Path, most_bytes: int | None = None) -> str:
     return ""
 
 
-# Bytes. File systems allow 255; the difference leaves room for a prefix, a suffix and the mark of an unfinished file.
+# Bytes in a file name. File systems allow 255; the rest is for a prefix, a suffix, and the mark of an unfinished file.
 LONGEST = 150
 
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from pathreplay.errors import PathreplayError
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
-#: The user's value of DRJIT_LIBLLVM_PATH, which `import pathreplay` may later set, or replace if it cannot work.
+#: The user's value of DRJIT_LIBLLVM_PATH. `import pathreplay` may change the variable after this line has read it.
 ASKED_FOR = os.environ.get(ENVIRONMENT_VARIABLE, "")
 PIP_DISTRIBUTION = "karellen-llvm-core"
 OLDEST_USABLE_MAJOR = 17
