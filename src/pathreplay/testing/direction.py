@@ -137,6 +137,6 @@ def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
             return FORWARD
         if (value - 2 * move >= 0).all():
             return BACKWARD
-    # Use central differences also if both one-sided stencils would reach negative values, for example at zeros of the
-    # parameter if a given direction has mixed signs. Negative values are harmless if the image is linear in them.
+    # Both one-sided stencils may reach negative values, too: for example, if the parameter has zeros and a given
+    # direction has mixed signs. Central differences are used then, which are harmless if the image is linear there.
     return CENTRAL

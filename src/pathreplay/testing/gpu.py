@@ -1,7 +1,7 @@
 """Gradient checks and timings on a machine with a GPU, written to one file: `pathreplay doctor --gpu`.
 
-Each item runs in its own process, because running out of device memory may crash the process. If an item fails, the
-file contains its error message, and the remaining items still run.
+Each check or timing is an item, and runs in its own process, because running out of device memory may crash the
+process. If an item fails, the file contains its error message, and the remaining items still run.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ TIMINGS: dict[str, tuple[Json, int, int, int]] = {
         ("replay", "pathreplay", {"adjoint": "replay"}),
     )
 }
-# Timings at large depth of recorded paths and of replay, the two methods between which adjoint = 'auto' chooses.
+# Timings at large depths. adjoint = 'auto' chooses between the two methods, recorded paths and replay.
 TIMINGS |= {
     f"{adjoint}, 512 x 512, depth {depth}": ({"type": "pathreplay", "adjoint": adjoint}, 512, 16, depth)
     for adjoint, depth in (("recorded", 256), ("recorded", 448), ("replay", 448), ("replay", 2048))

@@ -1,8 +1,8 @@
 """The objective of a check, F(t): a weighted mean of the image, as a function of one parameter along a curve.
 
-F(π) = Σ_k w_k I_k(π) / n, with the parameter π, the n values I_k of the image and their weights w_k, is linear in the
-image. The gradient of one noisy image is therefore an unbiased sample of the gradient of F, and the difference of two
-noisy images is an unbiased sample of a difference of F.
+Let π be the parameter, I_k the n values of the image, and w_k their weights. The objective F(π) = Σ_k w_k I_k(π) / n is
+linear in the image. The gradient of one noisy image is therefore an unbiased sample of the gradient of F, and the
+difference of two noisy images is an unbiased sample of a difference of F.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ Loss = Callable[["mi.TensorXf"], "mi.Float"]
 @contextmanager
 def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
     """Detach all parameters, so that only ``key`` will be attached; restore everything at the end."""
-    # The values are copied, because the map returns references into the scene, whose values are about to change.
+    # Copy the values, because `params` returns references into the scene, whose values are about to change.
     held = {name: dr.copy(params[name]) for name in params.keys() if name == key or dr.grad_enabled(params[name])}
-    # Values are set through the map, followed by update(), because objects cache values derived from their parameters.
+    # Set values through `params`, followed by update(), because objects cache values derived from their parameters.
     for name, value in held.items():
         params[name] = dr.detach(value)
     params.update()
