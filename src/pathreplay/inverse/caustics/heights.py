@@ -120,11 +120,11 @@ def _resampled(density: Field, shape: tuple[int, int]) -> Field:
 
 
 def _sources(φ: Field, aspect: float, margin: int = 0) -> tuple[Field, Field]:
-    """Return the point S(y) of the surface whose light arrives at y, for each cell y of the receiver.
+    """Return the point S(y) of the surface from which light arrives at y, for each cell y of the receiver.
 
-    Rows and columns are in units of cells. S is the gradient of the potential v (see `monge_ampere`) for cells of width
-    ``aspect`` and height 1, scaled to the extent of the surface. A ``margin`` adds cells beyond the border, for which
-    the potential is mirrored.
+    S is the gradient of the potential v = |y|²/2 + φ(y) for cells of width ``aspect`` and height 1 (see
+    `monge_ampere`), scaled to the extent of the surface. The results are its rows and its columns, in units of cells. A
+    ``margin`` adds cells beyond the border, for which the potential is mirrored.
     """
     p = np.pad(φ, margin + 1, mode="symmetric")
     rows, columns = (np.arange(-margin, n + margin) for n in φ.shape)
