@@ -101,7 +101,7 @@ class Previews:
         self.folder.discard([STOP])
 
     def finished(self, after: Mapping[str, Image]) -> dict[str, tuple[Still, ...]]:
-        """Add last frames that show the results, and return the time-lapse frames for the report, by subject.
+        """Add a last frame with the result to each time-lapse film, and return the frames for the report, by subject.
 
         Subjects are view-NAME, texture-NAME and volume-NAME. ``after`` contains the final image of each view, by name.
         """

@@ -1,4 +1,4 @@
-"""Makes a film of a run as WebP or MP4, which shows the target beside the current image after several iterations."""
+"""Makes a film of a run as WebP or MP4, whose frames show the target beside the image of one iteration."""
 
 from __future__ import annotations
 
