@@ -298,8 +298,8 @@ def flat_colours(resolution: int = 32) -> SceneDict:
 def glass_ball(resolution: int = 32) -> SceneDict:
     """Describe a glass sphere (index 1.5, radius 0.5) in front of panels of one colour each.
 
-    The sphere is visible only because it refracts and reflects light. The key of its index is ``glass.eta``, and the key
-    of its pose is ``ball.to_world``.
+    The sphere is visible only because it refracts and reflects light. The key of its index is ``glass.eta``, and
+    the key of its pose is ``ball.to_world``.
     """
 
     def at(x: float, y: float, z: float, width: float, height: float) -> mi.ScalarTransform4f:

@@ -114,7 +114,7 @@ def _observed(resolution: int, high: float, distance: float, receiver_width: flo
 
 
 def _half(rows: int, columns: int) -> Array:
-    """Return half the width and height of a surface whose map has width 1. The surface ends half a cell before the map."""
+    """Return half the width and height of a surface whose map has width 1. Its border is half a cell inside the map."""
     return np.array([columns - 1, rows - 1]) / columns * _WIDTH / 2
 
 
