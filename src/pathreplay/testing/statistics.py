@@ -31,7 +31,7 @@ def mean_and_error(samples: ArrayLike) -> tuple[Numbers, Numbers]:
 
 
 def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
-    """Compare the means of independent samples (n, ...) and (m, ...). If ``b`` has no sample axis, it is exact."""
+    """Compare the means of independent samples (n, ...) and (m, ...). Without a sample axis, ``b`` is exact."""
     a, b = np.asarray(a), np.asarray(b)
     known = b.ndim < a.ndim
     (mean_a, error_a), (mean_b, error_b) = mean_and_error(a), (b, 0) if known else mean_and_error(b)
