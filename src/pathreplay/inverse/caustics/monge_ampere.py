@@ -112,7 +112,7 @@ def _centred(field: Field) -> Field:
 
 
 def _longest(φ: Field, step: Field, least: Field, width: float) -> float:
-    """Shorten a step until v is convex and det D²v is at least ``least``; return its factor, or 0 if it is too short."""
+    """Shorten a step until v is convex and det D²v is at least ``least``. Return the factor, or 0 if none suffices."""
     factor = 1.0
     while factor > _SHORTEST:
         a, b, c = hessian(φ + factor * step, width)

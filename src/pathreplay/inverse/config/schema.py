@@ -173,7 +173,7 @@ class Config(Table):
         total = begins(self.stages or [])[-1]
         if self.stages is not None:
             if "iterations" not in self.model_fields_set:
-                # The model is frozen, so __dict__ is changed. The value does not count as given by the user, and is not saved.
+                # The model is frozen, so __dict__ is changed. The value does not count as given, and is not saved.
                 self.__dict__["iterations"] = total
             elif self.iterations != total:
                 raise ValueError(
@@ -222,7 +222,7 @@ class Config(Table):
             "final_learning_rate_ratio" in self.model_fields_set
             and "learning_rate_schedule" not in self.model_fields_set
         ):
-            # The model is frozen, so __dict__ is changed. The value does not count as given by the user, and is not saved.
+            # The model is frozen, so __dict__ is changed. The value does not count as given, and is not saved.
             self.__dict__["learning_rate_schedule"] = "exponential"
         if self.learning_rate_schedule == "constant" and "final_learning_rate_ratio" in self.model_fields_set:
             raise ValueError(
