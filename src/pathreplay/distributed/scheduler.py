@@ -70,7 +70,7 @@ class Scheduler:
     waited: dict[Actor, float] = field(default_factory=dict)
     """Per actor: sum of ``refused`` over earlier steps, since the actor last took a shard from another owner."""
     refused: dict[Actor, float] = field(default_factory=dict)
-    """Per idle actor that took no shard from the busiest owner in this step: the remaining seconds of the owner's work."""
+    """Per actor that took no shard of the busiest owner in this step: the remaining seconds of the owner's work."""
 
     def begin(self) -> None:
         """Begin a step: add the seconds in ``refused``, from the previous step, to ``waited``."""
