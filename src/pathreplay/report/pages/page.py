@@ -145,7 +145,7 @@ class Page:
     """Display exposure of all views, unless the reader chooses the best exposure of each view."""
     left: str = "target"
     right: str = "result"
-    """``left`` and ``right`` are the kinds of the images that are initially shown beside the movable border."""
+    """``left`` and ``right`` are the kinds of the images at first shown left and right of the movable border."""
     plots: tuple[Plot, ...] = ()
     plots_note: str = ""
     drawing: str = ""
