@@ -31,14 +31,19 @@ def _git(*arguments: str) -> str:
     return result.stdout.strip() if result.returncode == 0 else ""
 
 
+def commit(changed: bool = False) -> str:
+    """Return the short hash of the current commit, followed by '+' if the code has ``changed`` since."""
+    modified = _git("status", "--porcelain", "--untracked-files=no", "--", "src", "benchmarks/*.py")
+    return _git("rev-parse", "--short=12", "HEAD") + ("+" if modified or changed else "")
+
+
 def make_record(task: str, command: str, load_before: float, measured: Measured, draft: Draft) -> Record:
     """The record of a run that has just ended."""
-    modified = _git("status", "--porcelain", "--untracked-files=no", "--", "src", "benchmarks/*.py")
     return Record(
         task=task,
         command=command,
         date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        commit=_git("rev-parse", "--short=12", "HEAD") + ("+" if modified or draft.stale else ""),
+        commit=commit(draft.stale),
         load=(load_before, load_average()),
         machines=tuple(measured.machines),
         points=tuple(measured.points),
