@@ -5,7 +5,7 @@
     python -m benchmarks.gallery cloud --reuse       # draw the images again, from the last finished run
     python -m benchmarks.gallery --page              # write the page again, from the record
 
-Runs are written to runs/gallery, and the record to benchmarks/results/gallery.json after each run. The machine has to
+Runs are written to runs/gallery, and the record to benchmarks/gallery/record.json after each run. The machine has to
 be idle: a run does not start while other processes are busy, and a time during which they became busy is not shown.
 --busy runs nevertheless, and shows no time.
 """

@@ -13,11 +13,10 @@ from pydantic import TypeAdapter, ValidationError
 from pathreplay.errors import PathreplayError
 
 from ..drafts import ROOT
-from ..records import RESULTS
 from .entries import ENTRIES, Entry
 from .runs import Run
 
-RECORD = RESULTS / "gallery.json"
+RECORD = Path(__file__).parent / "record.json"
 PAGE = ROOT / "docs" / "gallery.md"
 IMAGES = ROOT / "docs" / "images" / "gallery"
 KINDS = "start", "result", "target"

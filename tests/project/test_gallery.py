@@ -53,7 +53,8 @@ def test_the_page_is_that_of_the_record() -> None:
     assert {path.stem for path in page.IMAGES.glob("*")} == set(record), "an image for each run, and no other file"
     for path in page.IMAGES.glob("*"):
         assert path.stat().st_size <= page.MOST_BYTES
-        assert Image.open(path).format == "PNG"
+        with Image.open(path) as image:
+            assert image.format == "PNG"
 
 
 def test_a_time_is_shown_where_the_machine_was_idle_alone() -> None:
