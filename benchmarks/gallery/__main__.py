@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     known = {entry.name: entry for entry in ENTRIES}
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(known)}. Default: all.")
-    parser.add_argument("--busy", action="store_true", help="run on a busy machine, too; the page shows no times")
+    parser.add_argument("--busy", action="store_true", help="run on a busy machine, too")
     parser.add_argument("--reuse", action="store_true", help="run nothing; use the last finished runs")
     parser.add_argument("--page", action="store_true", help="run and draw nothing; write the page from the record")
     parser.add_argument("--runs", type=Path, default=RUNS, metavar="FOLDER", help="folder of the runs")

@@ -17,7 +17,7 @@ import notebook_cells
 from notebook_cells import FOLDER, NAMES, Notebook
 from places import ROOT
 
-#: Far above what any takes on two idle cores, which is a minute.
+#: A notebook that hangs must not hang the tests.
 TIMEOUT_S = 1800
 EFFECTS = {"print", "show"}
 
