@@ -62,8 +62,8 @@ def _tangents(
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
     L = Spectrum(0)  # without the factor δL
     q = Vector(0)
-    J = Matrix(1)  # ∂r_i/∂r_0
-    κ = [Spectrum(0) for _ in range(4)]  # ∂ log β_i / ∂r_0 for each coordinate
+    J = Matrix(1)  # Jacobian ∂r_i/∂r_0 of the ray that arrives at vertex i
+    κ = [Spectrum(0) for _ in range(4)]  # ∂ log β_i / ∂r_0, one spectrum for each of the four coordinates of r_0
 
     while dr.hint(path.active, exclude=[trace, recovery, scale], label="pathreplay: tangents"):
         u, step = path.choose(trace, sampler)

@@ -53,7 +53,7 @@ class Arc:
     p: mi.Float  # density of the sampled direction
     f: mi.Spectrum  # scattering of light from the sampled direction
     active: mi.Bool  # the sample is valid
-    j: mi.UInt32 | None  # index of its length; None: all lengths are equal, and the sample is the centre
+    j: mi.UInt32 | None  # index of the length; None: all arcs have the same length, and the sample is the centre
 
     @classmethod
     def draw(cls: type[A], observer: ObserverVertex, l: float, narrow: bool, key: mi.UInt32, active: mi.Bool) -> A:
@@ -90,7 +90,11 @@ class Arc:
 
     @dr.syntax
     def _density(self, active: mi.Bool) -> mi.Float:
-        """Return the mean of p(d_i) P_j(p(d_i)) over all possible positions d_i of the sample."""
+        """Return the density of the arc: the mean of p(d_i) P_j(p(d_i)) over the `POSITIONS` directions d_i of the arc.
+
+        The sampled direction is one of the d_i. p(d_i) is the density of samples in direction d_i, and P_j is the
+        probability of the arc's length (see `probability`).
+        """
         assert self.j is not None
         arc, j, i, total = self, self.j, mi.UInt32(0), mi.Float(0)
         while dr.hint(i < POSITIONS, exclude=[arc, j, active], label="pathreplay: density of an arc"):
@@ -110,7 +114,7 @@ def density_of_samples(pdf: mi.Float) -> mi.Float:
 
 
 def draw_length(p: mi.Float, sampler: CounterSampler) -> mi.UInt32:
-    """Select j with probability P_j(p), see `probability`."""
+    """Draw the index j of a length with probability P_j(p) (see `probability`)."""
     u, v = sampler.next_1d(), sampler.next_1d()
     j = dr.select(u < ANY_LENGTH, mi.UInt32(u * (LENGTHS / ANY_LENGTH)), mi.UInt32(_level(p) + v))
     return dr.minimum(j, LENGTHS - 1)
@@ -122,12 +126,12 @@ def probability(p: mi.Float, j: mi.UInt32) -> mi.Float:
 
 
 def _position(i: mi.UInt32) -> mi.Float:
-    """Return the i-th position of the sample, in arc lengths from the centre."""
+    """Return the i-th possible position of the sample, as its distance from the centre in arc lengths."""
     return (mi.Float(i) + 0.5) / POSITIONS - 0.5
 
 
 def _level(p: mi.Float) -> mi.Float:
-    """Return the index j of the length that suits density p, as a real number, clipped to the valid range."""
+    """Return the real number j at which p_j = `BROAD` · 2^(4j) equals p, clipped to the range of the indices."""
     return dr.clip(dr.log2(p / BROAD) / 4, 0, LENGTHS - 1)
 
 

@@ -1,7 +1,7 @@
 """Edges between surfaces, seen from a vertex in directions that its BSDF or phase function samples.
 
-Segments are arcs (see `arcs`). Different surfaces, or different sheets of one surface, are visible at the ends of an
-arc. The edge between them is an outline, a crease or the boundary of a hard shadow.
+The edges are searched on arcs of directions (see `arcs`). An edge is found if different surfaces, or different sheets of
+one surface, are visible at the ends of an arc. It is an outline, a crease or the boundary of a hard shadow.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ class ArcSegment(Arc):
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         near = closeness(trace, seen)
         if trace.media is not None:
-            # Directions also follow hit points on null boundaries, whose outlines are therefore edges.
+            # A direction may follow its hit point on a moving null boundary (see `ObserverVertex.holds`). The outline of
+            # a null boundary is therefore an edge.
             boundary = place_met(trace, first, active, shape_met(trace, first, ray, active), facets=False)
             place, moves = mixed(place, boundary), moves | may_move(trace, first)
             near = dr.maximum(near, closeness(trace, first))
@@ -187,7 +188,7 @@ class OcclusionEdge:
 
 @dataclass
 class HeldEdge:
-    """The motion of an occluder's edge: the direction d to the edge follows the near surface. See `Crossing`."""
+    """The motion V_edge of the direction to an edge, which follows a point of the near surface. See `Crossing`."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge
@@ -201,7 +202,7 @@ class HeldEdge:
 
 @dataclass
 class MovedSide:
-    """The motion V of sampled directions on one side of an edge, as in the interior term. See `Crossing`."""
+    """The motion V of sampled directions on one side of an edge. It is the same as in the interior term."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge

@@ -72,7 +72,7 @@ class FilmCrossing:
 
 @dataclass(frozen=True)
 class PrimarySearch(FilmSearch[FilmSegment]):
-    """Edge search on the film, for edges that camera rays and chains of delta lobes hit."""
+    """Edge search on the film. It finds edges that are visible directly or through chains of delta lobes."""
 
     bisection = Stream.BISECT_PRIMARY
 

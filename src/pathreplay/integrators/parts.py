@@ -82,7 +82,7 @@ class Sums:
         self.take()
 
     def take(self) -> None:
-        """Add the gradients accumulated since the last call, and reset them."""
+        """Add the current gradients of the parameters to the sums, and reset the gradients to zero."""
         for n, value in enumerate(self._values):
             gradient = dr.grad(value)
             self._sums[n] = gradient if self._sums[n] is None else self._sums[n] + gradient
@@ -90,7 +90,7 @@ class Sums:
         dr.eval(self._sums)
 
     def give(self) -> None:
-        """Write the sums to the parameters."""
+        """Set the gradients of the parameters to the sums."""
         for value, total in zip(self._values, self._sums, strict=True):
             dr.set_grad(value, total)
 

@@ -153,7 +153,7 @@ def stateful(integrator: mi.Integrator) -> StatefulIntegrator:
 
 
 def no_pixel_sweep(name: str) -> str:
-    """Return why an integrator of this class has no pixel sweep, with the remedy."""
+    """Return why the integrator class ``name`` does not implement `adjoint.pixel_sweep`, with the remedy."""
     return f"{name} renders whole images only; take the integrator 'pathreplay'"
 
 

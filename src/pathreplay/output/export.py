@@ -130,7 +130,10 @@ def _source(job: Job, values: Arrays) -> Source:
 
 
 def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
-    """Return the 8-bit image files of optimized textures. The run stored these textures as floating-point numbers."""
+    """Return the image files of optimized textures that Mitsuba would load as 8-bit integers.
+
+    The run stored the texels of these files as floating-point numbers, and the export must store them in the same way.
+    """
     keys = [key for key in values if key.endswith(".data")]
     if not keys:
         return ()

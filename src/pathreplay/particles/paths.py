@@ -1,9 +1,12 @@
 """Loops over light paths: the image, its tangent, and the sweep that back-propagates its adjoint.
 
 Each lane traces many light paths one after the other. Memory therefore does not depend on the number of light paths.
-The radiance throughput of a path is W_0 β, with W_0 the weight of its first ray. Let A(s) be the adjoint of the image
-as a fixed function of film position. The derivative of a loss is then the derivative of Σ W_0 L_0, with L_i = A(s_i)
-c_i + w_i L_{i+1}.
+The radiance throughput of a path is W_0 β, with W_0 the weight of its first ray. Vertex i contributes W_0 β_i c_i to
+the image at film position s_i (see `Splat`). The weight of the continuation of the path is w_i. Let A(s) be the adjoint
+of the image as a fixed function of film position. The derivative of a loss is then the derivative of Σ W_0 L_0, summed
+over all paths, with
+
+    L_i = A(s_i) c_i + w_i L_{i+1}.
 """
 
 from __future__ import annotations

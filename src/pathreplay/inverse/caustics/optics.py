@@ -96,10 +96,11 @@ class Optics:
         return ray / length, abs(ray[..., 2]) / length[..., 0] ** 3
 
     def normal(self, incoming: Field, outgoing: Field) -> Field:
-        """Return a vector parallel to the normal (..., 3) that directs light from ``incoming`` to ``outgoing``.
+        """Return normals (..., 3) of a surface that directs light from ``incoming`` to ``outgoing``. Not normalized.
 
-        By Snell's law, eta (incoming) - (outgoing) is parallel to the normal of a slab. The normal of a mirror is the
-        half vector. Neither has unit length.
+        ``incoming`` and ``outgoing`` are unit vectors in the direction of propagation. By Snell's law, the normal of a
+        slab is parallel to eta · ``incoming`` - ``outgoing``. By the law of reflection, the normal of a mirror is
+        parallel to ``outgoing`` - ``incoming``.
 
         Raises:
             PathreplayError: the required deflection of a ray exceeds the deflection at the critical angle.

@@ -49,11 +49,11 @@ class Tables:
     are created while `dr.freeze` records (see `_array`).
     """
 
-    attachable: mi.Bool | None  # whether the smooth lobes of each BSDF may be sampled attached; None: of no BSDF
+    attachable: mi.Bool | None  # for each BSDF, whether its smooth lobes may be sampled attached; None: no BSDF
     blend_lengths: mi.Float  # `velocity.blend_length` of each shape
     groups_at: mi.UInt32  # for each shape, the offset of its triangles in `groups`, or `WHOLE` or `FACETS`
-    groups: mi.UInt32  # concatenated `smoothing_groups` of the meshes with an offset; entry 0 is unused
-    emitter_bounds: mi.Float  # bounding spheres of mesh emitters: see `emitter_bounds`
+    groups: mi.UInt32  # `smoothing_groups` of all meshes that have an offset, concatenated; entry 0 is unused
+    emitter_bounds: mi.Float  # bounding sphere of each emitter: see `emitter_bounds`
 
 
 @dataclass(frozen=True)
