@@ -1,7 +1,7 @@
 """Edges between surfaces, seen from a vertex in directions that its BSDF or phase function samples.
 
-The edges are searched on arcs of directions (see `arcs`). An edge is found if different surfaces, or different sheets of
-one surface, are visible at the ends of an arc. It is an outline, a crease or the boundary of a hard shadow.
+The edges are searched on arcs of directions (see `arcs`). An edge crosses an arc if different surfaces, or different
+sheets of one surface, are visible at its ends. The edge is an outline, a crease or the boundary of a hard shadow.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class ArcSegment(Arc):
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         near = closeness(trace, seen)
         if trace.media is not None:
-            # A direction may follow its hit point on a moving null boundary (see `ObserverVertex.holds`). The outline of
-            # a null boundary is therefore an edge.
+            # Directions may follow their hit points on a moving null boundary (see `ObserverVertex.holds`). The outline
+            # of a null boundary is therefore an edge.
             boundary = place_met(trace, first, active, shape_met(trace, first, ray, active), facets=False)
             place, moves = mixed(place, boundary), moves | may_move(trace, first)
             near = dr.maximum(near, closeness(trace, first))
