@@ -32,7 +32,7 @@ CASES = {
 DEPTHS, QUICK_DEPTHS = (4, 16, 48), (4,)
 #: Caustic designs: the grid of learning rates (in widths of the slab) and samples per pixel, and processor seconds.
 SMALL, LARGE = CELLS
-RATES, QUICK_RATES = (1e-6, 3e-6, 1e-5, 3e-5), (3e-5,)
+RATES, QUICK_RATES = (1e-7, 3e-7, 3e-6, 3e-5), (3e-5,)
 DESIGN_SAMPLES, QUICK_DESIGN_SAMPLES = (4, 32), (4,)
 SECONDS, QUICK_SECONDS = 180.0, 2.0
 #: Fractions of these seconds.
