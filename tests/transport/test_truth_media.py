@@ -76,6 +76,13 @@ def glowing(emission: float = 1.0) -> dict:
     return smooth_cloud(plugin="gridmedium", emission=grid(emission * smooth(0.1, 0.6, 3)))
 
 
+def thick(density: np.ndarray | None = None) -> dict:
+    """A cloud that scatters little and has a radiance of its own."""
+    density = smooth(0.4, 2.0) if density is None else density
+    radiance = grid(smooth(0.2, 3.0, 3))
+    return cloud(heterogeneous(density, constant(0.3), plugin="gridmedium", radiance=radiance))
+
+
 def rainbow() -> dict:
     return homogeneous(rgb(0.7, 0.5, 0.35), rgb(0.8, 0.6, 0.4), scale=2.0)
 
@@ -188,6 +195,13 @@ EMISSION = [
     cell("gridmedium density, glowing", lambda: glowing(3.0), DENSITY, random(1.0), reference="pathreplay"),
     cell("gridmedium scale, glowing", lambda: glowing(3.0), MEDIUM + "scale", add(), reference="pathreplay"),
     cell("gridmedium albedo, glowing", lambda: glowing(3.0), ALBEDO, random(0.5), reference="pathreplay"),
+    cell("gridmedium radiance", thick, MEDIUM + "radiance.data", random(1.0), reference="pathreplay"),
+    cell("gridmedium density, radiance", thick, DENSITY, random(1.0), reference="pathreplay"),
+    cell("gridmedium scale, radiance", thick, MEDIUM + "scale", add(), reference="pathreplay"),
+    cell("gridmedium density, radiance, empty voxels", lambda: thick(checkers()), DENSITY, where(1 - checkers()),
+         reference="pathreplay", **UP),
+    cell("gridmedium radiance, camera", thick, "camera.to_world", translate(0.5, 0.2, 1), reference="pathreplay",
+         **{**MOVES, "step": 0.12}),
 ]  # fmt: skip
 
 CASES = GRIDS + HOMOGENEOUS + PLACES + EMISSION

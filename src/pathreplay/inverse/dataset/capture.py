@@ -138,3 +138,19 @@ def _camera(photo: Photo, size: tuple[int, int], width: int | None, pixel_format
             "rfilter": {"type": "box"},
         },
     }
+
+
+def put_inside(scene: mi.Scene, names: set[str], medium: str) -> None:
+    """Put cameras of the capture, by name, inside a medium of the scene.
+
+    Raises PathreplayError if no shape of the scene bounds a medium with this id.
+    """
+    bounded = [shape.interior_medium() for shape in scene.shapes()] + [s.exterior_medium() for s in scene.shapes()]
+    media = {each.id(): each for each in bounded if each is not None}
+    if medium not in media:
+        raise PathreplayError(
+            f"capture.medium '{medium}' is the id of no medium of the scene; it has {', '.join(media) or 'none'}"
+        )
+    for sensor in scene.sensors():
+        if sensor.id() in names:
+            sensor.set_medium(media[medium])

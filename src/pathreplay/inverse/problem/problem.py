@@ -23,7 +23,7 @@ from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import TARGET, Config
 from pathreplay.inverse.config.tables import Plugin
 from pathreplay.inverse.config.user_functions import Modules
-from pathreplay.inverse.dataset.capture import Shot, fingerprint, read_capture
+from pathreplay.inverse.dataset.capture import Shot, fingerprint, put_inside, read_capture
 from pathreplay.inverse.dataset.targets import (
     Reading,
     Targets,
@@ -250,6 +250,8 @@ def build_problem(
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
     scene, config, notes = _loaded(config, base, shots, given)
+    if config.capture is not None and config.capture.medium is not None:
+        put_inside(scene, set(shots), config.capture.medium)
     params = traversed(scene)
     parameters.require_finite(params)
     integrator = given.integrator

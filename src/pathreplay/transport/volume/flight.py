@@ -80,7 +80,8 @@ def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, acti
                 if dr.hint(grid.emission is not None, mode="scalar"):
                     glows = inside & is_grid(grid, medium)
                     c = mi.Spectrum(W * dr.rcp(σ_bar))
-                    E = dr.select(glows, E + c * dr.detach(grid.emission_at(mei, glows)), E)
+                    if dr.hint(not grid.emission_per_extinction, mode="scalar"):
+                        E = dr.select(glows, E + c * dr.detach(grid.emission_at(mei, glows)), E)
                     count = dr.select(glows, count + 1, count)
                     picked = glows & (sampler.next_1d(glows) * count < 1)
                     t_emit = dr.select(picked, t_next, t_emit)
@@ -101,6 +102,12 @@ def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, acti
             bare = dr.select(kept, share / m, bare)
         if dr.hint(media.chromatic, mode="scalar"):
             W = dr.select(flying, W * (1 - σ_t / σ_bar) * reciprocal(1 - p), W)
+        if dr.hint(media.emissive, mode="scalar"):
+            for grid in media.grids:
+                if dr.hint(grid.emission is not None and grid.emission_per_extinction, mode="scalar"):
+                    glows = real & is_grid(grid, medium)
+                    L = W * σ_t * dr.rcp(p * σ_bar) * dr.detach(grid.emission_at(mei, glows))
+                    E = dr.select(glows, L, E)
         event |= real
         density = dr.select(real, p * σ_bar, density)
         p_real = dr.select(real, p, p_real)
@@ -195,11 +202,12 @@ def fly_again(
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
         σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))
     w_event = σ_s * stretch * dr.rcp(flight.density)
-    w = dr.select(event, w_event, 1) * flight.W
+    w, one = dr.select(event, w_event, 1) * flight.W, mi.Spectrum(1)
     e = mi.Spectrum(0)
     if dr.grad_enabled(σ_y, length):
         log_T = dr.select(through, -length / POINTS * sum(σ_y), 0)
-        w *= dr.replace_grad(mi.Spectrum(1), log_T)
+        one = dr.replace_grad(one, log_T)
+        w *= one
         if trace.baseline is not None:
             σ_bar = majorant(medium, ray, in_medium)
             guesses = [σ * _guess(trace, y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
@@ -219,7 +227,15 @@ def fly_again(
                     length = dr.select(glows, t - a, 0)
                     at_e = interaction(medium, ray, t)
                     at_y = interaction(medium, ray, a + flight.along * length)
-                ε = grid.emission_at(at_e, glows) * flight.c_emit * J
+                ε = grid.emission_at(at_e, glows)
+                if grid.emission_per_extinction:
+                    _, _, σ_e = medium.get_scattering_coefficients(at_e, glows)
+                    emitted += dr.select(glows, dr.detach(ε) * σ_e * flight.c_emit * J, 0)
+                    ends = event & is_grid(grid, medium)
+                    weight = flight.W * dr.detach(medium.get_scattering_coefficients(mei, ends)[2]) * dr.rcp(flight.density)
+                    emitted += dr.select(ends, one * weight * grid.emission_at(mei, ends), 0)
+                    continue
+                ε *= flight.c_emit * J
                 _, _, σ_here = medium.get_scattering_coefficients(at_y, glows)
                 if dr.grad_enabled(σ_here, length):
                     ε *= dr.replace_grad(mi.Spectrum(1), -length * σ_here)
