@@ -35,7 +35,7 @@ from pathreplay.inverse.config.target_options import NOTHING, Capture, Exposure,
 from pathreplay.platform.files import MISSING, file_problem
 from pathreplay.types import Json
 
-PIXELWISE = ("l2", "relative-l2")
+PIXELWISE = ("l2", "relative-l2", "display-l2")
 """Losses that support pixel batches and Levenberg-Marquardt: the names of the losses in `pixelwise.QUADRATIC`."""
 CORNERED = ("l1", "relative-l1", "smape")
 """Losses whose derivative jumps where image and target are equal."""

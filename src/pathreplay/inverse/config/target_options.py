@@ -71,8 +71,6 @@ class Capture(Table):
     """Folder of masks, each named as its image with '.png' appended."""
     width: Count | None = None
     """Width of rendered images in pixels; default: the width of the images of the capture."""
-    skip_missing: Switch = False
-    """Leave out frames whose image file does not exist; by default, they are an error."""
     medium: str | None = None
     """Id of the medium of the scene that contains the cameras; default: none."""
     test_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None

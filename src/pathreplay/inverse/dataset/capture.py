@@ -71,7 +71,7 @@ def read_capture(
         if masks is not None:
             photos = [replace(photo, mask=_mask(photo, masks)) for photo in photos]
     shots = {}
-    for name, photo in zip(_names([photo.name for photo in photos]), photos, strict=True):
+    for name, photo in zip(view_names([photo.name for photo in photos]), photos, strict=True):
         camera = _camera(photo, size_of(photo.image), capture.width, pixel_format)
         lens = None if photo.lens.is_pinhole else photo.lens
         shots[name] = Shot(photo.image, photo.mask, {**camera, "id": name}, lens)
@@ -95,7 +95,7 @@ def _mask(photo: Photo, masks: Path) -> Path:
     return mask
 
 
-def _names(files: list[str]) -> list[str]:
+def view_names(files: list[str]) -> list[str]:
     """Make a unique name for each image, which is valid as the name of a sensor and of a file.
 
     The names are the stems of the file names, or the paths if two images have the same stem.
