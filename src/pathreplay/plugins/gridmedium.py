@@ -10,9 +10,9 @@ the radiance B.
 Mitsuba's integrators use a global majorant and ignore the emission. The integrators of this package call `free_flight`
 (local majorants), `transmittance` (residual ratio tracking) and `emission_at`.
 
-The coefficients and the emission are differentiable with respect to V, A, Q, B, s and the position. Majorants, free-flight
-distances and the transmittance estimate are detached. The bounding box and the `to_world` of volumes are *not*
-differentiated.
+The coefficients and the emission are differentiable with respect to V, A, Q, B, s and the position. Majorants,
+free-flight distances and the transmittance estimate are detached. The bounding box and the `to_world` of volumes are
+*not* differentiated.
 """
 
 from __future__ import annotations
@@ -116,7 +116,9 @@ class GridMedium:
         for name in ("scale", "albedo", "sigma_t"):
             cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
         if self.emission is not None:
-            cb.put("radiance" if self.emission_per_extinction else "emission", self.emission, mi.ParamFlags.Differentiable)
+            cb.put(
+                "radiance" if self.emission_per_extinction else "emission", self.emission, mi.ParamFlags.Differentiable
+            )
         cb.put("phase_function", self.phase_function(), mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:

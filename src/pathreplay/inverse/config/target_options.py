@@ -90,6 +90,28 @@ class Capture(Table):
         return self
 
 
+class Response(Table):
+    """The response curve of the camera, shared by all views, which is recovered along with the parameters."""
+
+    kind: Literal["gamma", "curve"] = "curve"
+    """'gamma' is a power of the stored values, after their decoding from sRGB. 'curve' is monotone and piecewise linear
+    in the sRGB encoding of both sides."""
+    segments: Annotated[Whole, Field(ge=2, le=256, multiple_of=2)] = 16
+    """Number of segments of a curve."""
+    fix_exponent: Switch = False
+    """Fix the middle knot of a curve. Images determine the curve only up to a power if exposures and all emitted
+    radiance are free."""
+    learning_rate: Positive | None = None
+    """Learning rate of the logarithms of the exponent or of the slopes; default: the learning rate of the job."""
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Response:
+        given = {"segments", "fix_exponent"} & self.model_fields_set
+        if self.kind == "gamma" and given:
+            raise ValueError(f"response: '{min(given)}' applies to kind = 'curve' only; remove it")
+        return self
+
+
 class Exposure(Table):
     """Scale factors on the rendered image of each view, which are recovered along with the parameters."""
 

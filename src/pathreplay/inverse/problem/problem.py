@@ -48,6 +48,10 @@ from pathreplay.inverse.parameters.exposures import EXPOSURE, Factors, fixed_row
 from pathreplay.inverse.parameters.exposures import start as start_of_exposures
 from pathreplay.inverse.parameters.grids import rmse
 from pathreplay.inverse.parameters.pose import Pose
+from pathreplay.inverse.parameters.reparameterization import Transform
+from pathreplay.inverse.parameters.response import RESPONSE
+from pathreplay.inverse.parameters.response import coordinates as coordinates_of_response
+from pathreplay.inverse.parameters.response import start as start_of_response
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import Variable, free_of, keys_of, make_variables
 from pathreplay.inverse.problem import feasibility
@@ -296,7 +300,7 @@ def build_problem(
         View(name, index, targets.images[name], targets.weights.get(name), name in test_views, shares[name])
         for name, index in sensors.items()
     )
-    unsolved += _exposures(scene, config, views)
+    unsolved += _exposures(scene, config, views) + _response(config)
     for view in views:
         feasibility.require_finite_loss(loss, view.name, view.target, view.weight)
         disk.rest()
@@ -387,6 +391,16 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
     fixed = fixed_rows([view.name for view in views], trained, reference, not options.fix_scale)
     rate = options.learning_rate or config.learning_rate
     return [Variable(EXPOSURE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=Factors(fixed))]
+
+
+def _response(config: Config) -> list[Variable]:
+    """Return a list that contains the variable of the camera response, or an empty list if the job has none."""
+    if (options := config.response) is None:
+        return []
+    value = start_of_response(None if options.kind == "gamma" else options.segments)
+    curve = Transform("log") if options.kind == "gamma" else coordinates_of_response(value, options.fix_exponent)
+    rate = options.learning_rate or config.learning_rate
+    return [Variable(RESPONSE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=curve)]
 
 
 def _pictures(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -48,7 +47,7 @@ class PhotoJob:
         return self.folder / JOB
 
 
-def from_photos(  # noqa: PLR0913 (options of the command)
+def from_photos(
     folder: str | Path,
     output: str | Path,
     *,
@@ -93,7 +92,9 @@ def from_photos(  # noqa: PLR0913 (options of the command)
             _write(part, picture.files())
             entries.append(picture.entry())
             prepared.add(picture)
-        _write(part, {TRANSFORMS: (json.dumps({"camera_model": "PINHOLE", "frames": entries}, indent=1) + "\n").encode()})
+        _write(
+            part, {TRANSFORMS: (json.dumps({"camera_model": "PINHOLE", "frames": entries}, indent=1) + "\n").encode()}
+        )
         has_sky = not prepared.transparent
         _write_start(part, region, prepared.mean, proxy)
         text = field_scene(region, has_sky) if proxy is None else mesh_scene(proxy.stored, proxy.kind, proxy.textured)

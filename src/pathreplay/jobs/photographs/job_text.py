@@ -88,11 +88,7 @@ def mesh_scene(file: str, kind: str, texture: bool) -> str:
 
 
 def _sky() -> str:
-    return (
-        '  <emitter type="envmap" id="sky">\n'
-        '    <string name="filename" value="start/sky.exr"/>\n'
-        "  </emitter>\n"
-    )
+    return '  <emitter type="envmap" id="sky">\n    <string name="filename" value="start/sky.exr"/>\n  </emitter>\n'
 
 
 def _xyz(values: object) -> str:

@@ -6,7 +6,6 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import PIL.Image
@@ -102,7 +101,9 @@ def frames_of(photos: Sequence[Photo], width: int | None) -> list[Frame]:
         high = lens.h * scale * lens.fx / lens.fy  # pixels become square
         rows = int(high + 1e-6) // BLOCK * BLOCK
         if rows < BLOCK:
-            raise PathreplayError(f"{photo.where} has only {high:.0f} rows at a width of {columns}; give a larger width")
+            raise PathreplayError(
+                f"{photo.where} has only {high:.0f} rows at a width of {columns}; give a larger width"
+            )
         focal, cy = lens.fx * scale, lens.cy * scale * lens.fx / lens.fy - (high - rows) / 2
         frames.append(Frame(name, columns, rows, focal, lens.cx * scale, cy, photo.place))
     return frames

@@ -85,6 +85,8 @@ def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: 
     for k, (factor, count) in enumerate(counts.items()):
         size = round(RESOLUTION * max(width, height) / factor)
         stages.append(
-            StagePlan(min(max(count, LEAST), MOST), factor, min(max(size, COARSEST), FINEST), k == 0 and len(counts) > 1)
+            StagePlan(
+                min(max(count, LEAST), MOST), factor, min(max(size, COARSEST), FINEST), k == 0 and len(counts) > 1
+            )
         )
     return Plan(stages, views, name)

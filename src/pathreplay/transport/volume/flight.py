@@ -232,7 +232,9 @@ def fly_again(
                     _, _, σ_e = medium.get_scattering_coefficients(at_e, glows)
                     emitted += dr.select(glows, dr.detach(ε) * σ_e * flight.c_emit * J, 0)
                     ends = event & is_grid(grid, medium)
-                    weight = flight.W * dr.detach(medium.get_scattering_coefficients(mei, ends)[2]) * dr.rcp(flight.density)
+                    weight = (
+                        flight.W * dr.detach(medium.get_scattering_coefficients(mei, ends)[2]) * dr.rcp(flight.density)
+                    )
                     emitted += dr.select(ends, one * weight * grid.emission_at(mei, ends), 0)
                     continue
                 ε *= flight.c_emit * J
