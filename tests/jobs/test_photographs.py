@@ -75,7 +75,7 @@ def test_a_job_is_written(capture: Path, tmp_path: Path) -> None:
     assert config.capture is not None
     assert config.capture.test_every == 5
     assert {entry.key.split(".")[-2] for entry in config.parameters} == {"sigma_t", "radiance", "sky"}
-    assert (written.folder / "images" / "3.png").is_file()
+    assert (written.folder / "images" / "view_3.png").is_file()
     assert not (written.folder / "masks").exists()
     scene = mi.load_file(str(written.folder / "scene.xml"))
     box = scene.shapes()[0].bbox()
@@ -181,5 +181,5 @@ def test_from_photos_to_a_mesh(capture: Path, tmp_path: Path) -> None:
     export_surface(result.folder)
     scene = mi.load_file(str(result.folder / "surface" / "scene.xml"))
     image = np.array(mi.render(scene, sensor=1, spp=16))
-    target = np.array(mi.Bitmap(str(result.folder / "images" / "target-1.exr")))
+    target = np.array(mi.Bitmap(str(result.folder / "images" / "target-view_1.exr")))
     assert np.abs(image - target).mean() < 0.15

@@ -8,6 +8,7 @@ four such cells, whose vertices form a quadrilateral.
 from __future__ import annotations
 
 from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +32,10 @@ def surface(density: NDArray[np.floating], level: float) -> tuple[NDArray[np.flo
     inside = values > 0
     cells = tuple(n - 1 for n in values.shape)
 
-    def corner(array: NDArray, at: tuple[int, int, int]) -> NDArray:
+    def corner(array: NDArray[Any], at: tuple[int, ...]) -> NDArray[Any]:
         return array[tuple(slice(o, o + n) for o, n in zip(at, cells, strict=True))]
 
-    count = sum(corner(inside, at).astype(np.int8) for at in _CORNERS)
+    count = np.sum([corner(inside, at) for at in _CORNERS], axis=0)
     mixed = (count > 0) & (count < 8)
     where = np.argwhere(mixed)
     number = np.full(cells, -1, np.int64)

@@ -17,7 +17,7 @@ from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.jobs.photographs.job_text import SKY_SIZE, Choices, field_scene, job_text, mesh_scene
 from pathreplay.jobs.photographs.mesh import GREY, Proxy, read_proxy
 from pathreplay.jobs.photographs.pictures import Frame, Prepared, frames_of, prepare
-from pathreplay.jobs.photographs.plan import Speed, plan_stages
+from pathreplay.jobs.photographs.plan import Speed, StagePlan, plan_stages
 from pathreplay.jobs.photographs.reading import TRANSFORMS, find_photos
 from pathreplay.jobs.photographs.region import Box, find_region
 from pathreplay.platform import backend
@@ -112,8 +112,8 @@ def from_photos(
     return PhotoJob(output, notes)
 
 
-def _stages_note(stages: Sequence[object], width: int, height: int) -> str:
-    parts = [f"{s.iterations} iterations at {width // s.downscale} x {height // s.downscale} pixels" for s in stages]  # type: ignore[attr-defined]
+def _stages_note(stages: Sequence[StagePlan], width: int, height: int) -> str:
+    parts = [f"{s.iterations} iterations at {width // s.downscale} x {height // s.downscale} pixels" for s in stages]
     return "stages: " + ", ".join(parts)
 
 

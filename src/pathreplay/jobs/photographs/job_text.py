@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from xml.sax.saxutils import quoteattr
 
-from pathreplay.jobs.photographs.plan import Plan
+from pathreplay.jobs.photographs.plan import EVAL_SPP, Plan
 from pathreplay.jobs.photographs.region import Box
 
 DENSITY, RADIANCE, SKY = "box.interior_medium.sigma_t.data", "box.interior_medium.radiance.data", "sky.data"
@@ -91,8 +92,8 @@ def _sky() -> str:
     return '  <emitter type="envmap" id="sky">\n    <string name="filename" value="start/sky.exr"/>\n  </emitter>\n'
 
 
-def _xyz(values: object) -> str:
-    return " ".join(f'{axis}="{value:.9g}"' for axis, value in zip("xyz", values, strict=True))  # type: ignore[call-overload]
+def _xyz(values: Iterable[float]) -> str:
+    return " ".join(f'{axis}="{value:.9g}"' for axis, value in zip("xyz", values, strict=True))
 
 
 def job_text(source: str, plan: Plan, choices: Choices, test_every: int, mesh_key: str | None = None) -> str:
@@ -101,11 +102,11 @@ def job_text(source: str, plan: Plan, choices: Choices, test_every: int, mesh_ke
     tables += _field(plan) if mesh_key is None else [_colour(mesh_key)]
     if choices.has_sky:
         tables.append(_SKY)
+    tables.append(_commented(_RESPONSE))
     tables.append(_POSES if choices.refine_poses else _commented(_POSES))
     for stage in plan.stages:
         text = f"[[stages]]\niterations = {stage.iterations}\ndownscale = {stage.downscale}\n"
-        if stage.rate != 1:
-            text += f"learning_rate_factor = {stage.rate:g}\n"
+        text += f"view_batch_size = {stage.views}\nspp = {stage.spp}\n"
         if names := _moving(stage.first, choices, mesh_key):
             text += f"parameters = [{', '.join(f'{name!r}' for name in names)}]\n".replace("'", '"')
         tables.append(text)
@@ -128,9 +129,7 @@ def _head(source: str, plan: Plan, test_every: int, in_medium: bool) -> str:
 
 scene = "scene.xml"
 loss = "display-l2"                  # squared differences as a display shows them
-spp = {plan.spp}
-eval_spp = {plan.eval_spp}
-view_batch_size = {plan.views}
+eval_spp = {EVAL_SPP}
 learning_rate = 0.02
 final_learning_rate_ratio = 0.1
 
@@ -190,6 +189,14 @@ key = "view_*.to_world"              # the poses of the photographs
 pose = "rigid"
 learning_rate = 0.001                # scene units
 rotation_learning_rate = 0.02        # degrees
+"""
+
+
+_RESPONSE = """\
+[response]                           # a response of the camera other than sRGB
+kind = "curve"
+fix_exponent = true
+learning_rate = 0.02
 """
 
 

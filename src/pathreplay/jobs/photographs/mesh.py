@@ -49,7 +49,7 @@ class Proxy:
             shutil.copyfile(self.path, target)
             return
         mesh = _loaded(self.path)
-        mesh.add_attribute("vertex_color", 3, [GREY] * (3 * mesh.vertex_count()))
+        mesh.add_attribute("vertex_color", 3, np.full(3 * mesh.vertex_count(), GREY, np.float32))
         mesh.write_ply(str(target))
 
 

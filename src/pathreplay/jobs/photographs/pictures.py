@@ -28,6 +28,8 @@ from pathreplay.types import Json
 
 PIXELS = 46_000
 """Number of pixels of a prepared image, unless its width is given."""
+PREFIX = "view_"
+"""Beginning of the names of cameras, by which a job selects them."""
 BLOCK = 8
 """Width and height are multiples of this number, so that stages can downscale films."""
 
@@ -105,7 +107,7 @@ def frames_of(photos: Sequence[Photo], width: int | None) -> list[Frame]:
                 f"{photo.where} has only {high:.0f} rows at a width of {columns}; give a larger width"
             )
         focal, cy = lens.fx * scale, lens.cy * scale * lens.fx / lens.fy - (high - rows) / 2
-        frames.append(Frame(name, columns, rows, focal, lens.cx * scale, cy, photo.place))
+        frames.append(Frame(f"{PREFIX}{name}", columns, rows, focal, lens.cx * scale, cy, photo.place))
     return frames
 
 

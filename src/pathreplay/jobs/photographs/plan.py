@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-SPP = 4
 EVAL_SPP = 16
 VIEWS = 8
-"""Training views per iteration."""
+"""Training views per iteration, half as many at full resolution."""
+SAMPLES = 160_000
+"""Samples per iteration, with 1 to `MOST_SPP` per pixel: many noisy steps go further than a few exact ones."""
+MOST_SPP = 4
 SHARES = {8: 0.1, 4: 0.2, 2: 0.3, 1: 0.4}
 """Fraction of the time for each stage, by the factor by which images are reduced."""
 RESOLUTION = 0.75
@@ -18,6 +20,8 @@ LEAST, MOST = 40, 1500
 """Smallest and largest number of iterations of a stage."""
 PASSES = 5.0
 """Time of an iteration per sample, relative to rendering an image: image, record, reverse sweep, second image."""
+A_VIEW = 0.03
+"""Seconds per view and iteration that do not depend on the number of samples."""
 USED = 0.75
 """Fraction of the time limit that the plan uses, without rendering of test views and writing."""
 
@@ -29,19 +33,18 @@ class StagePlan:
     iterations: int
     downscale: int
     resolution: int
+    views: int
+    spp: int
     first: bool
-    rate: float = 1.0
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The stages of a job, and its numbers of samples and views."""
+    """The stages of a job."""
 
     stages: list[StagePlan]
-    views: int
     name: str
-    spp: int = SPP
-    eval_spp: int = EVAL_SPP
+    """Path of the job."""
 
 
 @dataclass(frozen=True)
@@ -67,26 +70,19 @@ def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: 
         height: height of the images in pixels.
         name: path of the job.
     """
-    views = min(VIEWS, trained)
-    seconds = 60 * minutes * USED
-    shares = dict(SHARES)
+    seconds, shares = 60 * minutes * USED, dict(SHARES)
     while True:
-        left = seconds - len(shares) * 2 * trained * speed.tracing
-        total = sum(shares.values())
-        counts = {}
-        for factor, share in shares.items():
-            step = views * SPP * PASSES * (width // factor) * (height // factor) / speed.samples
-            counts[factor] = int(max(left, 0) * share / total / step)
-        finest = min(shares)
-        if counts[finest] >= LEAST or len(shares) == 1:
+        left = max(seconds - len(shares) * 2 * trained * speed.tracing, 0.0)
+        stages = []
+        for k, (factor, share) in enumerate(shares.items()):
+            pixels = (width // factor) * (height // factor)
+            views = min(VIEWS if factor > 1 else VIEWS // 2, trained)
+            spp = min(max(round(SAMPLES / (views * pixels)), 1), MOST_SPP)
+            step = views * (A_VIEW + spp * PASSES * pixels / speed.samples)
+            size = min(max(round(RESOLUTION * max(width, height) / factor), COARSEST), FINEST)
+            count = int(left * share / sum(shares.values()) / step)
+            stages.append(StagePlan(count, factor, size, views, spp, k == 0 and len(shares) > 1))
+        if stages[-1].iterations >= LEAST or len(shares) == 1:
             break
-        del shares[finest]
-    stages = []
-    for k, (factor, count) in enumerate(counts.items()):
-        size = round(RESOLUTION * max(width, height) / factor)
-        stages.append(
-            StagePlan(
-                min(max(count, LEAST), MOST), factor, min(max(size, COARSEST), FINEST), k == 0 and len(counts) > 1
-            )
-        )
-    return Plan(stages, views, name)
+        del shares[stages[-1].downscale]
+    return Plan([replace(s, iterations=min(max(s.iterations, LEAST), MOST)) for s in stages], name)
