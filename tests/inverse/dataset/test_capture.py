@@ -416,7 +416,5 @@ def test_cameras_inside_a_medium(folder: Path) -> None:
     image = np.array(mi.render(problem.scene, sensor=sensor, integrator=problem.integrator, spp=256))
     assert image.mean() == pytest.approx(np.exp(-0.1 * 55), rel=0.3)  # from z = 5 to the far wall at -50
     job["capture"]["medium"] = "mist"
-    with pytest.raises(
-        PathreplayError, match=r"capture\.medium 'mist' is the id of no medium of the scene; it has fog"
-    ):
+    with pytest.raises(PathreplayError, match=r"capture\.medium 'mist' is the id of no medium .*; it has fog"):
         build_problem(make_config(job), folder)

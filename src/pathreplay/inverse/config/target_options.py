@@ -71,6 +71,8 @@ class Capture(Table):
     """Folder of masks, each named as its image with '.png' appended."""
     width: Count | None = None
     """Width of rendered images in pixels; default: the width of the images of the capture."""
+    near_clip: Positive = 1e-3
+    """Distance from a camera, along its axis, from which objects are visible, in scene units."""
     medium: str | None = None
     """Id of the medium of the scene that contains the cameras; default: none."""
     test_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None

@@ -19,18 +19,19 @@ from pathreplay.jobs.photographs.mesh import GREY, Proxy, read_proxy
 from pathreplay.jobs.photographs.pictures import Frame, Prepared, frames_of, prepare
 from pathreplay.jobs.photographs.plan import Speed, StagePlan, plan_stages
 from pathreplay.jobs.photographs.reading import TRANSFORMS, find_photos
-from pathreplay.jobs.photographs.region import Box, find_region
+from pathreplay.jobs.photographs.region import Box, find_region, near_clip
 from pathreplay.platform import backend
 from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.scenes.loading import load_scene
 from pathreplay.types import Json
 
 JOB = "job.toml"
-OPTICAL_DEPTH = 0.5
+OPTICAL_DEPTH = 1.5
 """Optical depth of the initial medium along the longest side of the region."""
 COARSE = 32
 """Voxels along the longest side of the initial grids; stages resample them."""
 TIMED_SPP = 4
+NO_CLIP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -100,10 +101,11 @@ def from_photos(
         text = field_scene(region, has_sky) if proxy is None else mesh_scene(proxy.stored, proxy.kind, proxy.textured)
         _write(part, {"scene.xml": text.encode()})
         size = max(frame.width for frame in frames), max(frame.height for frame in frames)
-        speed = measure(part / "scene.xml", frames)
+        near = near_clip(frames) if proxy is None else NO_CLIP
+        speed = measure(part / "scene.xml", frames, near)
         tell(f"this machine renders {speed.samples / 1e6:.2g} million samples per second")
         plan = plan_stages(speed, minutes, trained, *size, str(output / JOB))
-        choices = Choices(has_sky or proxy is not None, refine_poses)
+        choices = Choices(has_sky or proxy is not None, refine_poses, near)
         key = None if proxy is None else proxy.key
         _write(part, {JOB: job_text(str(folder), plan, choices, test_every, key).encode()})
     corners = " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (region.low, region.high))
@@ -170,10 +172,10 @@ def _write_start(folder: Path, region: Box, mean: np.ndarray, proxy: Proxy | Non
     mi.VolumeGrid(np.ascontiguousarray(radiance)).write(str(start / "radiance.vol"))
 
 
-def measure(scene: Path, frames: Sequence[Frame]) -> Speed:
+def measure(scene: Path, frames: Sequence[Frame], near: float) -> Speed:
     """Measure how fast this machine renders a scene from one of the cameras."""
     frame = frames[len(frames) // 2]
-    camera = camera_of(frame)
+    camera = camera_of(frame, near)
     loaded = load_scene(scene)
     sensor = mi.load_dict(camera)
     times = []
@@ -185,14 +187,14 @@ def measure(scene: Path, frames: Sequence[Frame]) -> Speed:
     return Speed(frame.width * frame.height * TIMED_SPP / warm, max(times[0] - warm, 0.05))
 
 
-def camera_of(frame: Frame) -> Json:
+def camera_of(frame: Frame, near: float) -> Json:
     """Return the Mitsuba dictionary of a frame's camera."""
     film = {"type": "hdrfilm", "width": frame.width, "height": frame.height, "pixel_format": "rgb"}
     return {
         "type": "perspective",
         "fov": float(np.degrees(2 * np.arctan(frame.width / (2 * frame.focal)))),
         "fov_axis": "x",
-        "near_clip": 1e-3,
+        "near_clip": near,
         "far_clip": 1e5,
         "principal_point_offset_x": 0.5 - frame.cx / frame.width,
         "principal_point_offset_y": 0.5 - frame.cy / frame.height,

@@ -19,6 +19,7 @@ class Choices:
 
     has_sky: bool
     refine_poses: bool
+    near_clip: float
 
 
 def field_scene(box: Box, has_sky: bool) -> str:
@@ -98,7 +99,7 @@ def _xyz(values: Iterable[float]) -> str:
 
 def job_text(source: str, plan: Plan, choices: Choices, test_every: int, mesh_key: str | None = None) -> str:
     """Return the job: ``mesh_key`` is the reflectance of a given mesh, or None for a density grid."""
-    tables = [_head(source, plan, test_every, mesh_key is None), _EXPOSURE]
+    tables = [_head(source, choices.near_clip, plan, test_every, mesh_key is None), _EXPOSURE]
     tables += _field(plan) if mesh_key is None else [_colour(mesh_key)]
     if choices.has_sky:
         tables.append(_SKY)
@@ -120,7 +121,7 @@ def _moving(first: bool, choices: Choices, mesh_key: str | None) -> list[str]:
     return [*([DENSITY, RADIANCE] if mesh_key is None else [mesh_key]), *([SKY] if choices.has_sky else [])]
 
 
-def _head(source: str, plan: Plan, test_every: int, in_medium: bool) -> str:
+def _head(source: str, near_clip: float, plan: Plan, test_every: int, in_medium: bool) -> str:
     medium = 'medium = "field"                     # cameras may be inside the box\n' if in_medium else ""
     return f"""\
 # Recovers a scene from photographs. Written by: pathreplay from-photos {source}
@@ -135,7 +136,8 @@ final_learning_rate_ratio = 0.1
 
 [capture]
 transforms = "transforms.json"       # images without lens distortion, written by the command
-{medium}test_every = {test_every}                       # test views are compared at the end
+{medium}near_clip = {near_clip:.4g}                    # no fog in front of the lens
+test_every = {test_every}                       # test views are compared at the end
 """
 
 
@@ -161,7 +163,7 @@ learning_rate = 0.1
 key = "{RADIANCE}"
 parameterization = "log"
 resolutions = [{sizes}]
-learning_rate = 0.05
+learning_rate = 0.1
 """,
     ]
 
@@ -180,7 +182,7 @@ _SKY = f"""\
 key = "{SKY}"
 parameterization = "log"
 pyramid = true
-learning_rate = 0.02
+learning_rate = 0.003
 """
 
 _POSES = """\

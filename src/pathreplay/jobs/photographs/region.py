@@ -12,8 +12,10 @@ from pathreplay.jobs.photographs.pictures import Frame
 
 REACH = 0.75
 """Half of the side of the cube that is searched, as a fraction of the median distance of the cameras."""
-SEEN_BY = 0.25
+SEEN_BY = 0.4
 """Fraction of the cameras that see a cell of the region."""
+NEAR = 0.35
+"""Distance from which a camera sees the medium, as a fraction of the smallest distance of a camera from the centre."""
 CELLS = 40
 """Number of cells along a side of the cube."""
 
@@ -58,12 +60,17 @@ def find_region(frames: Sequence[Frame]) -> Box:
     inside = cells[counts >= max(2.0, SEEN_BY * len(frames))]
     if not len(inside):
         raise PathreplayError(
-            "No part of space is seen by a quarter of the cameras; check the poses, or remove photos that show other "
-            "objects"
+            "No part of space is seen by enough cameras; check the poses, or remove photos that show other objects"
         )
     pad = half / CELLS
     low, high = inside.min(axis=0) - pad + centre, inside.max(axis=0) + pad + centre
     return Box(tuple(low.tolist()), tuple(high.tolist()))
+
+
+def near_clip(frames: Sequence[Frame]) -> float:
+    """Return a near clipping distance. Without it, fog in front of each camera would explain its photograph."""
+    places = np.array([frame.place for frame in frames])
+    return NEAR * float(np.linalg.norm(places[:, :3, 3] - _focus(places), axis=1).min())
 
 
 def _focus(places: np.ndarray) -> np.ndarray:
