@@ -8,10 +8,12 @@ four such cells, whose vertices form a quadrilateral.
 from __future__ import annotations
 
 from itertools import combinations, product
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+T = TypeVar("T", bound=np.generic)
 
 _CORNERS = list(product((0, 1), repeat=3))
 _EDGES = [(a, b) for a, b in combinations(range(8), 2) if np.abs(np.subtract(_CORNERS[a], _CORNERS[b])).sum() == 1]
@@ -32,7 +34,7 @@ def surface(density: NDArray[np.floating], level: float) -> tuple[NDArray[np.flo
     inside = values > 0
     cells = tuple(n - 1 for n in values.shape)
 
-    def corner(array: NDArray[Any], at: tuple[int, ...]) -> NDArray[Any]:
+    def corner(array: NDArray[T], at: tuple[int, ...]) -> NDArray[T]:
         return array[tuple(slice(o, o + n) for o, n in zip(at, cells, strict=True))]
 
     count = np.sum([corner(inside, at) for at in _CORNERS], axis=0)

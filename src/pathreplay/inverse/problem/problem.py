@@ -254,8 +254,6 @@ def build_problem(
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
     scene, config, notes = _loaded(config, base, shots, given)
-    if config.capture is not None and config.capture.medium is not None:
-        put_inside(scene, set(shots), config.capture.medium)
     params = traversed(scene)
     parameters.require_finite(params)
     integrator = given.integrator
@@ -327,6 +325,8 @@ def _loaded(
     wanted += [entry.key for entry in config.derived]
     cameras = {name: shot.camera for name, shot in shots.items()}
     scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
+    if config.capture is not None and config.capture.medium is not None:
+        put_inside(scene, set(shots), config.capture.medium)
     config, differences = completed(config, scene, given.integrator)
     return scene, config, notes + differences
 
