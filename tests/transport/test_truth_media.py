@@ -47,6 +47,11 @@ def where(mask: np.ndarray, scale: float = 1.0) -> Move:
     return lambda value, t: value + t * mi.TensorXf(direction.astype(np.float32))
 
 
+def grid_and_camera(value: Any, t: float) -> Any:
+    """Move a grid or the camera."""
+    return (random(1.0) if dr.is_tensor_v(value) else translate(0.5, 0.2, 1))(value, t)
+
+
 QUICK = {
     "constant density", "binary density, empty voxels", "black albedo", "phase g",
     "homogeneous chromatic density", "fog on a lit floor, density", "in a mirror, its index", "gridmedium emission",
@@ -200,6 +205,12 @@ EMISSION = [
     cell("gridmedium scale, radiance", thick, MEDIUM + "scale", add(), reference="pathreplay"),
     cell("gridmedium density, radiance, empty voxels", lambda: thick(checkers()), DENSITY, where(1 - checkers()),
          reference="pathreplay", **UP),
+    cell("gridmedium density, radiance, no branch", thick, DENSITY, random(1.0), reference="pathreplay",
+         options={"null_branching": False}),
+    cell("gridmedium density, radiance, coloured", lambda: thick(smooth(0.4, 2.0, 3)), DENSITY, random(1.0),
+         reference="pathreplay", options={"null_branching": False}),
+    cell("gridmedium density, radiance, moving", thick, (DENSITY, "camera.to_world"),
+         grid_and_camera, reference="pathreplay", options={"null_branching": False}, **{**MOVES, "step": 0.12}),
     cell("gridmedium radiance, camera", thick, "camera.to_world", translate(0.5, 0.2, 1), reference="pathreplay",
          **{**MOVES, "step": 0.12}),
 ]  # fmt: skip
