@@ -32,6 +32,8 @@ COARSE = 32
 """Voxels along the longest side of the initial grids; stages resample them."""
 TIMED_SPP = 4
 NO_CLIP = 1e-3
+HEADROOM = 1.3
+"""Upper bound of the radiance, relative to the brightest pixel."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def from_photos(
         speed = measure(part / "scene.xml", frames, near)
         tell(f"this machine renders {speed.samples / 1e6:.2g} million samples per second")
         plan = plan_stages(speed, minutes, trained, *size, str(output / JOB))
-        choices = Choices(has_sky or proxy is not None, refine_poses, near)
+        choices = Choices(has_sky or proxy is not None, refine_poses, near, HEADROOM * prepared.peak)
         key = None if proxy is None else proxy.key
         _write(part, {JOB: job_text(str(folder), plan, choices, test_every, key).encode()})
     corners = " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (region.low, region.high))
@@ -129,16 +131,17 @@ def _require_options(minutes: float, test_every: int, width: int | None) -> None
 
 
 class _Summary:
-    """Mean colour of the prepared images, and whether some of them are transparent."""
+    """Mean colour and largest value of the prepared images, and whether some of them are transparent."""
 
     def __init__(self) -> None:
-        self._sum, self._count, self.transparent = np.zeros(3), 0.0, False
+        self._sum, self._count, self.peak, self.transparent = np.zeros(3), 0.0, 0.0, False
 
     def add(self, picture: Prepared) -> None:
         """Add an image."""
         weight = np.ones((*picture.image.shape[:2], 1)) if picture.weight is None else picture.weight
         self._sum += (picture.image * weight).sum(axis=(0, 1))
         self._count += float(weight.sum())
+        self.peak = max(self.peak, float(picture.image.max()))
         self.transparent |= picture.transparent
 
     @property

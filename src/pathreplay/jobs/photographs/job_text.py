@@ -20,6 +20,8 @@ class Choices:
     has_sky: bool
     refine_poses: bool
     near_clip: float
+    brightest: float
+    """Upper bound of the radiance."""
 
 
 def field_scene(box: Box, has_sky: bool) -> str:
@@ -100,7 +102,7 @@ def _xyz(values: Iterable[float]) -> str:
 def job_text(source: str, plan: Plan, choices: Choices, test_every: int, mesh_key: str | None = None) -> str:
     """Return the job: ``mesh_key`` is the reflectance of a given mesh, or None for a density grid."""
     tables = [_head(source, choices.near_clip, plan, test_every, mesh_key is None), _EXPOSURE]
-    tables += _field(plan) if mesh_key is None else [_colour(mesh_key)]
+    tables += _field(plan, choices.brightest) if mesh_key is None else [_colour(mesh_key)]
     if choices.has_sky:
         tables.append(_SKY)
     tables.append(_commented(_RESPONSE))
@@ -148,7 +150,7 @@ learning_rate = 0.01
 """
 
 
-def _field(plan: Plan) -> list[str]:
+def _field(plan: Plan, brightest: float) -> list[str]:
     sizes = ", ".join(str(stage.resolution) for stage in plan.stages)
     return [
         f"""\
@@ -161,9 +163,12 @@ learning_rate = 0.1
         f"""\
 [[parameters]]
 key = "{RADIANCE}"
-parameterization = "log"
+parameterization = "logit"           # between the bounds, so that no voxel becomes a light
+lower = 0.0
+upper = {brightest:.3g}
 resolutions = [{sizes}]
 learning_rate = 0.1
+total_variation = 0.001
 """,
     ]
 

@@ -216,12 +216,12 @@ def fly_again(
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
         σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))
     w_event = σ_s * stretch * dr.rcp(flight.density)
-    w, one = dr.select(event, w_event, 1) * flight.W, mi.Spectrum(1)
-    e = mi.Spectrum(0)
+    w = dr.select(event, w_event, 1) * flight.W
+    e, T = mi.Spectrum(0), mi.Spectrum(1)
     if dr.grad_enabled(σ_y, length):
         log_T = dr.select(through, -length / POINTS * sum(σ_y), 0)
-        one = dr.replace_grad(one, log_T)
-        w *= one
+        w *= dr.replace_grad(mi.Spectrum(1), log_T)
+        T = dr.replace_grad(T, log_T)
         if trace.baseline is not None:
             σ_bar = majorant(medium, ray, in_medium)
             guesses = [σ * _guess(trace, y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
@@ -236,7 +236,7 @@ def fly_again(
             e += score - dr.detach(score)
 
     if trace.media.emissive:
-        e += dr.replace_grad(flight.E, _emission_again(trace, at, flight, (a, b), mei, one, attached, in_medium))
+        e += dr.replace_grad(flight.E, _emission_again(trace, at, flight, (a, b), mei, T, attached, in_medium))
     return Flown(mei=mei, w=w, e=e)
 
 
