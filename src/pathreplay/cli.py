@@ -201,6 +201,48 @@ def optimize(
     typer.echo(result.describe())
 
 
+@app.command(short_help="Recover a scene from photographs.")
+def from_photos(
+    folder: Annotated[Path, typer.Argument(help="Folder with a transforms.json or a COLMAP model, and the images.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="New folder; default: photos/<name>.")
+    ] = None,
+    mesh: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="PLY or OBJ of the geometry (default: a density grid).")
+    ] = None,
+    minutes: Annotated[float, typer.Option(help="Time limit, from which iterations follow.")] = 30.0,
+    test_every: Annotated[int, typer.Option(metavar="N", help="The first and every N-th photo are test views.")] = 5,
+    width: Annotated[int | None, typer.Option(help="Width of the compared images (default: 46 000 pixels).")] = None,
+    refine_poses: Annotated[bool, typer.Option("--refine-poses", help="Also optimise the poses.")] = False,
+    no_run: Annotated[bool, typer.Option("--no-run", help="Only write the job.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
+) -> None:
+    """Write a job that recovers a scene from photographs with poses, run it, and export the scene."""
+    with interrupts.undisturbed():  # signals must not interrupt imports; see `optimize`
+        from pathreplay.jobs import from_photos as write_job
+        from pathreplay.jobs import optimize as run_job
+        from pathreplay.output.export import export_run
+        from pathreplay.output.surface_scene import export_surface
+
+    def tell(line: str) -> None:
+        typer.echo(f"pathreplay: {plain_line(line)}", err=True)
+
+    output = Path("photos") / (folder.resolve().name or "scene") if output is None else output
+    written = write_job(
+        folder, output, mesh=mesh, minutes=minutes, test_every=test_every, width=width, refine_poses=refine_poses,
+        tell=tell,
+    )  # fmt: skip
+    for note in written.notes:
+        tell(note)
+    typer.echo(f"job: {written.job}")
+    if no_run:
+        typer.echo(f"run it with: pathreplay optimize {written.job} --output {output / 'run'}")
+        return
+    result = run_job(written.job, output=output / "run", progress=not quiet)
+    typer.echo(result.describe())
+    typer.echo(export_run(result.folder) if mesh is not None else export_surface(result.folder))
+
+
 @app.command(short_help="Follow a run in the browser.")
 def watch(
     run: Annotated[Path, typer.Argument(help="Run folder of an active or finished run.")],

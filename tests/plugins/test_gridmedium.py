@@ -471,6 +471,15 @@ def test_emission_is_radiance_per_length_and_not_scaled() -> None:
     assert "emission.value.value" in mi.traverse(grid)
 
 
+def test_emission_by_extinction() -> None:
+    grid = medium(smooth(), 8, radiance={"type": "rgb", "value": [0.2, 0.4, 3]})
+    assert grid.emission_per_extinction
+    np.testing.assert_allclose(np.array(grid.emission_at(at(mi.Point3f(0.5)))).ravel(), [0.2, 0.4, 3], rtol=1e-6)
+    assert "radiance.value.value" in mi.traverse(grid)
+    with pytest.raises(Exception, match="PathreplayError: gridmedium: emission and radiance are both given"):
+        medium(smooth(), 8, radiance=0.5, emission=0.5)
+
+
 @pytest.mark.parametrize(
     ("values", "scale", "pays"),
     [

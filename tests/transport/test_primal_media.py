@@ -313,8 +313,14 @@ def against(images: np.ndarray, expected: np.ndarray) -> float:
                sum_of_squares(deviates(grey, known)))  # fmt: skip
 
 
-def test_furnace() -> None:
-    scene = mi.load_dict(furnace())
+@pytest.mark.parametrize("per_extinction", [False, True])
+def test_furnace(per_extinction: bool) -> None:
+    description = furnace()
+    if per_extinction:  # the same emission, divided by the density
+        medium = description["object"]["interior"]
+        del medium["emission"]
+        medium["radiance"] = FURNACE * (1 - 0.6)
+    scene = mi.load_dict(description)
     assert against(pictures(scene, "pathreplay", 1, max_depth=64, rr_depth=64), np.float64(FURNACE)) < Z_LIMIT
 
 
@@ -336,11 +342,13 @@ def straight_through(scene: dict) -> dict:
     return scene
 
 
-def test_glow_of_a_slab() -> None:
+@pytest.mark.parametrize("per_extinction", [False, True])
+def test_glow_of_a_slab(per_extinction: bool) -> None:
     """Without scattering, L = Q/σ (1 - exp(-2σ)) + L_sky exp(-2σ) straight through the box."""
     σ, glow, sky = 0.8, 0.5, 0.3
     medium = homogeneous(σ, 0.0)
-    medium.update(type="gridmedium", emission={"type": "constvolume", "value": glow})
+    emitted = {"radiance": glow / σ} if per_extinction else {"emission": {"type": "constvolume", "value": glow}}
+    medium.update(type="gridmedium", **emitted)
     scene = straight_through(cloud(medium, sky={"type": "constant", "radiance": sky}))
     expected = glow / σ * (1 - np.exp(-2 * σ)) + sky * np.exp(-2 * σ)
     assert against(pictures(mi.load_dict(scene), "pathreplay", 1, max_depth=8), np.float64(expected)) < Z_LIMIT

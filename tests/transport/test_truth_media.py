@@ -47,6 +47,11 @@ def where(mask: np.ndarray, scale: float = 1.0) -> Move:
     return lambda value, t: value + t * mi.TensorXf(direction.astype(np.float32))
 
 
+def grid_and_camera(value: Any, t: float) -> Any:
+    """Move a grid or the camera."""
+    return (random(1.0) if dr.is_tensor_v(value) else translate(0.5, 0.2, 1))(value, t)
+
+
 QUICK = {
     "constant density", "binary density, empty voxels", "black albedo", "phase g",
     "homogeneous chromatic density", "fog on a lit floor, density", "in a mirror, its index", "gridmedium emission",
@@ -74,6 +79,13 @@ def smooth_cloud(**props: Any) -> dict:
 def glowing(emission: float = 1.0) -> dict:
     """A cloud under the sky that emits, too; volpath knows no emission."""
     return smooth_cloud(plugin="gridmedium", emission=grid(emission * smooth(0.1, 0.6, 3)))
+
+
+def thick(density: np.ndarray | None = None) -> dict:
+    """A cloud that scatters little and has a radiance of its own."""
+    density = smooth(0.4, 2.0) if density is None else density
+    radiance = grid(smooth(0.2, 3.0, 3))
+    return cloud(heterogeneous(density, constant(0.3), plugin="gridmedium", radiance=radiance))
 
 
 def rainbow() -> dict:
@@ -188,6 +200,19 @@ EMISSION = [
     cell("gridmedium density, glowing", lambda: glowing(3.0), DENSITY, random(1.0), reference="pathreplay"),
     cell("gridmedium scale, glowing", lambda: glowing(3.0), MEDIUM + "scale", add(), reference="pathreplay"),
     cell("gridmedium albedo, glowing", lambda: glowing(3.0), ALBEDO, random(0.5), reference="pathreplay"),
+    cell("gridmedium radiance", thick, MEDIUM + "radiance.data", random(1.0), reference="pathreplay"),
+    cell("gridmedium density, radiance", thick, DENSITY, random(1.0), reference="pathreplay"),
+    cell("gridmedium scale, radiance", thick, MEDIUM + "scale", add(), reference="pathreplay"),
+    cell("gridmedium density, radiance, empty voxels", lambda: thick(checkers()), DENSITY, where(1 - checkers()),
+         reference="pathreplay", **UP),
+    cell("gridmedium density, radiance, no branch", thick, DENSITY, random(1.0), reference="pathreplay",
+         options={"null_branching": False}),
+    cell("gridmedium density, radiance, coloured", lambda: thick(smooth(0.4, 2.0, 3)), DENSITY, random(1.0),
+         reference="pathreplay", options={"null_branching": False}),
+    cell("gridmedium density, radiance, moving", thick, (DENSITY, "camera.to_world"),
+         grid_and_camera, reference="pathreplay", options={"null_branching": False}, **{**MOVES, "step": 0.12}),
+    cell("gridmedium radiance, camera", thick, "camera.to_world", translate(0.5, 0.2, 1), reference="pathreplay",
+         **{**MOVES, "step": 0.12}),
 ]  # fmt: skip
 
 CASES = GRIDS + HOMOGENEOUS + PLACES + EMISSION

@@ -21,6 +21,7 @@ from pathreplay.inverse.dataset.capture import FACING, read_capture
 from pathreplay.inverse.images.io import picture_size, png_bytes
 from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.pose import PART_NAMES
+from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.output.scene_folder import SCENE, Exported, Source, exported, require_same
 from pathreplay.platform import backend, compat
@@ -63,13 +64,13 @@ def export_run(run: Path, output: Path | None = None) -> str:
     backend.set_variant(job.config.variant)
     values = _result(run)
     source = _source(job, values)
-    exposures = {EXPOSURE: values.pop(EXPOSURE)} if EXPOSURE in values else {}
+    photographic = {key: values.pop(key) for key in (EXPOSURE, RESPONSE) if key in values}
     free = {entry.key: values.pop(entry.key) for entry in job.config.parameters if entry.shape is not None}
     given = "integrator" in job.config.model_fields_set
     export = exported(source, values, job.config.integrator.model_dump() if given else None)
     with whole_folder(folder, _OPTION) as part:
         write_files(export, part)
-        for name, data in _beside(export, values | exposures, free).items():
+        for name, data in _beside(export, values | photographic, free).items():
             (part / name).parent.mkdir(exist_ok=True)
             (part / name).write_bytes(data)
         require_same(export.scene, part)
@@ -154,7 +155,7 @@ def _beside(export: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
     for key, value in values.items():
         if value.ndim == 3 and value.shape[2] <= 4:
             files[f"textures/{names[key]}.png"] = png_bytes(value)
-        elif value.size <= 16 or key == EXPOSURE:
+        elif value.size <= 16 or key in (EXPOSURE, RESPONSE):
             numbers[key] = value.tolist()
     for key, name in file_names(free).items():
         if free[key].size <= 16:

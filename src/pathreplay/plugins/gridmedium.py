@@ -4,12 +4,15 @@ With V, A and Q the volumes `sigma_t`, `albedo` and `emission`, and s the `scale
 
     σ_t = s V(x),   σ_s = A(x) σ_t,   emitted radiance per unit length = Q(x)   (Q is not scaled) .
 
+With the volume `radiance` B in place of `emission`, Q(x) = σ_t B(x): an optically thick medium without scattering has
+the radiance B.
+
 Mitsuba's integrators use a global majorant and ignore the emission. The integrators of this package call `free_flight`
 (local majorants), `transmittance` (residual ratio tracking) and `emission_at`.
 
-The coefficients and the emission are differentiable with respect to V, A, Q, s and the position. Majorants, free-flight
-distances and the transmittance estimate are detached. The bounding box and the `to_world` of volumes are *not*
-differentiated.
+The coefficients and the emission are differentiable with respect to V, A, Q, B, s and the position. Majorants,
+free-flight distances and the transmittance estimate are detached. The bounding box and the `to_world` of volumes are
+*not* differentiated.
 """
 
 from __future__ import annotations
@@ -56,6 +59,13 @@ EMISSION = Property(
     "Radiance emitted per unit length, which `scale` does not scale. Absent: no emission.",
     differentiable="emission.…",
 )
+RADIANCE = Property(
+    "radiance",
+    "volume or spectrum",
+    None,
+    "In place of `emission`: radiance emitted per unit of optical depth, which is the radiance of a thick medium.",
+    differentiable="radiance.…",
+)
 SUPERGRID = Property(
     "supergrid",
     "string or boolean",
@@ -75,7 +85,7 @@ PHASE = Property(
 class GridMedium:
     """A heterogeneous medium on grids, with local majorants. `on_base` combines this template with `mi.Medium`."""
 
-    properties = (SIGMA_T, SCALE, ALBEDO, EMISSION, SUPERGRID, PHASE)
+    properties = (SIGMA_T, SCALE, ALBEDO, EMISSION, RADIANCE, SUPERGRID, PHASE)
     phase_function: Callable[[], mi.PhaseFunction]  # a method of `mi.Medium`
 
     def __init__(self, props: mi.Properties) -> None:
@@ -88,7 +98,10 @@ class GridMedium:
             )
         self.sigma_t = _volume(props, SIGMA_T)
         self.albedo = _volume(props, ALBEDO)
-        self.emission = _volume(props, EMISSION)
+        self.emission_per_extinction = RADIANCE.name in props
+        if self.emission_per_extinction and EMISSION.name in props:
+            raise PathreplayError("gridmedium: emission and radiance are both given; remove one of them")
+        self.emission = _volume(props, RADIANCE if self.emission_per_extinction else EMISSION)
         self.scale = mi.Float(_number(props, SCALE))
         self.supergrid = _choice(props)
         self.m_is_homogeneous = False
@@ -100,9 +113,12 @@ class GridMedium:
     # ------------------------------------------------ parameters ------------------------------------------------
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
-        for name in ("scale", "albedo", "sigma_t", "emission"):
-            if getattr(self, name) is not None:
-                cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+        for name in ("scale", "albedo", "sigma_t"):
+            cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+        if self.emission is not None:
+            cb.put(
+                "radiance" if self.emission_per_extinction else "emission", self.emission, mi.ParamFlags.Differentiable
+            )
         cb.put("phase_function", self.phase_function(), mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
@@ -199,7 +215,10 @@ class GridMedium:
             return grid_traversal.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
 
     def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool | bool = True) -> mi.UnpolarizedSpectrum:
-        """Return the radiance emitted per unit length at an interaction; 0 without emission."""
+        """Return the radiance emitted per unit length at an interaction; 0 without emission.
+
+        If ``emission_per_extinction``, the result is the radiance emitted per unit of optical depth.
+        """
         return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from pathreplay.inverse.loop.checkpoint import Run
 from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.pose import Pose
+from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem, variables_of
 from pathreplay.platform import compat
@@ -22,7 +23,7 @@ from pathreplay.scenes.parameters import get_array
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
     """Return the parameters that are not poses. Derived parameters come last."""
     parts = {name for pose in problem.poses for name in pose.of}
-    truths = [(v.key, v.truth) for v in problem.variables if v.key not in parts and v.key != EXPOSURE]
+    truths = [(v.key, v.truth) for v in problem.variables if v.key not in parts and v.key not in (EXPOSURE, RESPONSE)]
     derived = {parameter.key: parameter.truth for parameter in problem.derived}
     truths += derived.items()
     starts = with_scene(problem, {v.key: v.start for v in problem.variables})

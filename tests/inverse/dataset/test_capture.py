@@ -398,3 +398,23 @@ def test_what_is_behind_transparent_pixels_does_not_bleed(folder: Path) -> None:
     assert view.weight is not None
     counts = view.weight[:, :, 0] > 0.05
     assert counts.any() and view.target[counts] == pytest.approx(1.0, abs=0.02)
+
+
+FOGGY = """<scene version="3.0.0">
+  <shape type="cube" id="room"><transform name="to_world"><scale value="50"/></transform>
+  <bsdf type="null"/><medium type="homogeneous" name="interior" id="fog"><float name="sigma_t" value="0.1"/>
+  <float name="albedo" value="0"/></medium></shape><emitter type="constant" id="sky"/></scene>"""
+
+
+def test_cameras_inside_a_medium(folder: Path) -> None:
+    """A camera sees the constant sky through the fog that surrounds it, up to the wall at its distance."""
+    (folder / "room.xml").write_text(FOGGY)
+    job = {**JOB, "parameters": [{"key": "sky.radiance.value"}], "integrator": {"type": "pathreplay", "max_depth": 1}}
+    job["capture"] = {**JOB["capture"], "medium": "fog"}
+    problem = build_problem(make_config(job), folder)
+    sensor = problem.scene.sensors()[0]
+    image = np.array(mi.render(problem.scene, sensor=sensor, integrator=problem.integrator, spp=256))
+    assert image.mean() == pytest.approx(np.exp(-0.1 * 55), rel=0.3)  # from z = 5 to the far wall at -50
+    job["capture"]["medium"] = "mist"
+    with pytest.raises(PathreplayError, match=r"capture\.medium 'mist' is the id of no medium .*; it has fog"):
+        build_problem(make_config(job), folder)

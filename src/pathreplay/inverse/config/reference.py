@@ -23,6 +23,7 @@ _TITLES = {
     "Target": "[target]",
     "Capture": "[capture]",
     "Exposure": "[exposure]",
+    "Response": "[response]",
     "Optimizer": "[optimizer]",
     "Plugin": "[integrator], [baseline], [target] integrator",
     "Stage": "[[stages]]",

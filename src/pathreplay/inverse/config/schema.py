@@ -31,11 +31,11 @@ from pathreplay.inverse.config.preview_options import Preview
 from pathreplay.inverse.config.schedules import Schedule
 from pathreplay.inverse.config.stage_options import Stage, begins
 from pathreplay.inverse.config.tables import Argument, Count, Plugin, Positive, Switch, Table, Whole
-from pathreplay.inverse.config.target_options import NOTHING, Capture, Exposure, Target
+from pathreplay.inverse.config.target_options import NOTHING, Capture, Exposure, Response, Target
 from pathreplay.platform.files import MISSING, file_problem
 from pathreplay.types import Json
 
-PIXELWISE = ("l2", "relative-l2")
+PIXELWISE = ("l2", "relative-l2", "display-l2")
 """Losses that support pixel batches and Levenberg-Marquardt: the names of the losses in `pixelwise.QUADRATIC`."""
 CORNERED = ("l1", "relative-l1", "smape")
 """Losses whose derivative jumps where image and target are equal."""
@@ -69,6 +69,8 @@ class Config(Table):
     """Images with camera poses; the cameras are added to the scene."""
     exposure: Exposure | None = None
     """Scale factors on the rendered image of each view, which are recovered along with the parameters."""
+    response: Response | None = None
+    """Response curve of the camera, which is recovered along with the parameters."""
     view_weights: dict[str, Positive] = Field(default_factory=dict)
     """Relative weights of views in the loss, by sensor; default: 1 each."""
     target: Target = Target()
@@ -271,6 +273,24 @@ class Config(Table):
         return self
 
     @model_validator(mode="after")
+    def _of_photos(self) -> Config:
+        if self.response is None:
+            return self
+        if self.loss not in PIXELWISE:
+            raise ValueError(
+                f"response: loss = '{self.loss}' is not quadratic in the image; use {' or '.join(PIXELWISE)}, or "
+                "remove 'response'"
+            )
+        if self.optimizer.is_second_order:
+            raise ValueError(
+                f"response: optimizer type = '{self.optimizer.type}' does not recover it; use 'adam', or remove one of "
+                "them"
+            )
+        if self.pixel_batch_size is not None or any(stage.pixel_batch_size for stage in self.stages or []):
+            raise ValueError("response: it needs whole images; remove 'pixel_batch_size' or 'response'")
+        return self
+
+    @model_validator(mode="after")
     def _extrapolated(self) -> Config:
         if not self.debias:
             return self
@@ -365,6 +385,7 @@ _TABLES: dict[str, type[BaseModel]] = {
     "adaptive_spp": AdaptiveSpp,
     "stages": Stage,
     "exposure": Exposure,
+    "response": Response,
     "ray": RayOptions,
 }
 

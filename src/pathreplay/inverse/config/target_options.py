@@ -71,6 +71,10 @@ class Capture(Table):
     """Folder of masks, each named as its image with '.png' appended."""
     width: Count | None = None
     """Width of rendered images in pixels; default: the width of the images of the capture."""
+    near_clip: Positive = 1e-3
+    """Distance from a camera, along its axis, from which objects are visible, in scene units."""
+    medium: str | None = None
+    """Id of the medium of the scene that contains the cameras; default: none."""
     test_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None
     """Number n: the first view and every n-th view after it are test views."""
 
@@ -85,6 +89,28 @@ class Capture(Table):
             raise ValueError("capture: give either 'transforms' (a transforms.json) or 'colmap' (a COLMAP model)")
         if self.images is not None and self.colmap is None:
             raise ValueError("capture: 'images' applies to 'colmap' only; remove it")
+        return self
+
+
+class Response(Table):
+    """The response curve of the camera, shared by all views, which is recovered along with the parameters."""
+
+    kind: Literal["gamma", "curve"] = "curve"
+    """'gamma' is a power of the stored values, after their decoding from sRGB. 'curve' is monotone and piecewise linear
+    in the sRGB encoding of both sides."""
+    segments: Annotated[Whole, Field(ge=2, le=256, multiple_of=2)] = 16
+    """Number of segments of a curve."""
+    fix_exponent: Switch = False
+    """Fix the middle knot of a curve. Images determine the curve only up to a power if exposures and all emitted
+    radiance are free."""
+    learning_rate: Positive | None = None
+    """Learning rate of the logarithms of the exponent or of the slopes; default: the learning rate of the job."""
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Response:
+        given = {"segments", "fix_exponent"} & self.model_fields_set
+        if self.kind == "gamma" and given:
+            raise ValueError(f"response: '{min(given)}' applies to kind = 'curve' only; remove it")
         return self
 
 

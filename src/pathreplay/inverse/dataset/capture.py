@@ -71,8 +71,8 @@ def read_capture(
         if masks is not None:
             photos = [replace(photo, mask=_mask(photo, masks)) for photo in photos]
     shots = {}
-    for name, photo in zip(_names([photo.name for photo in photos]), photos, strict=True):
-        camera = _camera(photo, size_of(photo.image), capture.width, pixel_format)
+    for name, photo in zip(view_names([photo.name for photo in photos]), photos, strict=True):
+        camera = _camera(photo, size_of(photo.image), capture, pixel_format)
         lens = None if photo.lens.is_pinhole else photo.lens
         shots[name] = Shot(photo.image, photo.mask, {**camera, "id": name}, lens)
     return shots
@@ -95,7 +95,7 @@ def _mask(photo: Photo, masks: Path) -> Path:
     return mask
 
 
-def _names(files: list[str]) -> list[str]:
+def view_names(files: list[str]) -> list[str]:
     """Make a unique name for each image, which is valid as the name of a sensor and of a file.
 
     The names are the stems of the file names, or the paths if two images have the same stem.
@@ -110,7 +110,7 @@ def _names(files: list[str]) -> list[str]:
     return list(file_names(words).values())
 
 
-def _camera(photo: Photo, size: tuple[int, int], width: int | None, pixel_format: str) -> SceneDict:
+def _camera(photo: Photo, size: tuple[int, int], capture: Capture, pixel_format: str) -> SceneDict:
     """Make the Mitsuba dictionary of the pinhole camera of a photo."""
     lens, axes = photo.lens, photo.place[:3, :3]
     if (
@@ -119,13 +119,13 @@ def _camera(photo: Photo, size: tuple[int, int], width: int | None, pixel_format
         or (photo.place[3] != [0, 0, 0, 1]).any()
     ):
         raise PathreplayError(f"{photo.where} has a transform_matrix that is not a rigid motion; correct it")
-    columns = size[0] if width is None else width
+    columns = size[0] if capture.width is None else capture.width
     rows = max(1, round(columns * size[1] / size[0]))
     return {
         "type": "perspective",
         "fov": math.degrees(2 * math.atan(lens.w / (2 * lens.fx))),
         "fov_axis": "x",
-        "near_clip": 1e-3,
+        "near_clip": capture.near_clip,
         "far_clip": 1e5,
         "principal_point_offset_x": 0.5 - lens.cx / lens.w,
         "principal_point_offset_y": 0.5 - lens.cy / lens.h,
@@ -138,3 +138,19 @@ def _camera(photo: Photo, size: tuple[int, int], width: int | None, pixel_format
             "rfilter": {"type": "box"},
         },
     }
+
+
+def put_inside(scene: mi.Scene, names: set[str], medium: str) -> None:
+    """Put cameras of the capture, by name, inside a medium of the scene.
+
+    Raises PathreplayError if no shape of the scene bounds a medium with this id.
+    """
+    bounded = [shape.interior_medium() for shape in scene.shapes()] + [s.exterior_medium() for s in scene.shapes()]
+    media = {each.id(): each for each in bounded if each is not None}
+    if medium not in media:
+        raise PathreplayError(
+            f"capture.medium '{medium}' is the id of no medium of the scene; it has {', '.join(media) or 'none'}"
+        )
+    for sensor in scene.sensors():
+        if sensor.id() in names:
+            sensor.set_medium(media[medium])

@@ -54,7 +54,11 @@ class _Posed:
 
 
 def photos_of_colmap(
-    folder: Path, images: Path | None, masks: Path | None, size_of: Callable[[Path], tuple[int, int]]
+    folder: Path,
+    images: Path | None,
+    masks: Path | None,
+    size_of: Callable[[Path], tuple[int, int]],
+    missing: list[str] | None = None,
 ) -> list[Photo]:
     """Read the photos of a COLMAP model, sorted by name.
 
@@ -63,6 +67,7 @@ def photos_of_colmap(
         images: folder of the images; default: ``../../images`` relative to the model.
         masks: folder of masks. A mask is named like its image with '.png' appended, as in COLMAP.
         size_of: returns the width and height of an image file.
+        missing: receives the names of images that do not exist, which are left out; None: they are an error.
 
     Raises:
         PathreplayError: a file cannot be read, or the model is inconsistent or not supported.
@@ -73,6 +78,9 @@ def photos_of_colmap(
     for entry in sorted(posed, key=lambda entry: entry.name):
         where = f"{folder}: image {shown(entry.name)}"
         image = pictures / entry.name
+        if missing is not None and file_problem(image) == MISSING:
+            missing.append(entry.name)
+            continue
         if problem := file_problem(image):
             raise PathreplayError(f"{where}: {image} {problem}; give the folder of the images as capture.images")
         mask = None if masks is None else masks / f"{entry.name}.png"

@@ -62,12 +62,15 @@ class _Transforms(_Intrinsics):
     frames: Annotated[list[_Frame], Field(min_length=1)]
 
 
-def photos_of_json(path: Path, size_of: Callable[[Path], tuple[int, int]]) -> list[Photo]:
+def photos_of_json(
+    path: Path, size_of: Callable[[Path], tuple[int, int]], missing: list[str] | None = None
+) -> list[Photo]:
     """Read the photos of a transforms.json, in the order of the file.
 
     Args:
         path: the file.
         size_of: returns the width and height of an image file.
+        missing: receives the names of images that do not exist, whose frames are left out; None: they are an error.
 
     Raises:
         PathreplayError: a file cannot be read, or the capture is inconsistent or not supported.
@@ -75,6 +78,9 @@ def photos_of_json(path: Path, size_of: Callable[[Path], tuple[int, int]]) -> li
     transforms = _read(path)
     fields, photos = set(_Intrinsics.model_fields), []
     for frame in transforms.frames:
+        if missing is not None and file_problem(_path(frame.file_path, path)) == MISSING:
+            missing.append(frame.file_path)
+            continue
         image = _picture(frame.file_path, path)
         own = frame.model_dump(include=fields, exclude_unset=True)
         table = transforms.model_dump(include=fields) | own
@@ -101,11 +107,16 @@ def _read(path: Path) -> _Transforms:
         raise PathreplayError(f"Capture {path} is not a valid transforms.json ({what}); correct it there") from None
 
 
-def _picture(name: str, path: Path) -> Path:
+def _path(name: str, path: Path) -> Path:
     image = path.parent / name
     if image.name and not image.suffix:
         named = [image.with_name(image.name + ending) for ending in ENDINGS]
         image = next((path for path in named if not file_problem(path)), image)
+    return image
+
+
+def _picture(name: str, path: Path) -> Path:
+    image = _path(name, path)
     if problem := file_problem(image):
         raise PathreplayError(f"Capture {path}: image {shown(name)} {problem}; correct the path or create the file")
     return image

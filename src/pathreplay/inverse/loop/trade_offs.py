@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pathreplay.inverse.loop.loop import picture_of
 from pathreplay.inverse.objective.evaluate import LARGE
 from pathreplay.inverse.parameters.exposures import EXPOSURE
+from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import Variable
 from pathreplay.inverse.problem.problem import Problem
@@ -65,7 +66,7 @@ def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Colu
         The columns by variable, and the variables that do not affect the images. Both are empty if there are too many
         variables, if a variable is too large, or if rendering all views would be too expensive.
     """
-    variables = [v for v in problem.variables if v.key != EXPOSURE]
+    variables = [v for v in problem.variables if v.key not in (EXPOSURE, RESPONSE)]
     if any(values[v.key].size >= LARGE for v in variables) or len(variables) > MOST_COLUMNS:
         return {}, ()
     changes = {v.key: _changes(v, values[v.key]) for v in variables}

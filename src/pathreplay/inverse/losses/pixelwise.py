@@ -4,9 +4,9 @@ A loss f(I, T) compares the rendered image I with the target T. The optimiser mi
 pixels and channels.
 
 The gradient is the product of f'(I, T) and the derivative of I, which are estimated from independent samples (see
-`frozen`). It is therefore unbiased if f' is linear in I, as for ``l2`` and ``relative-l2``. Noise in I biases the
-gradients of the other losses, and more samples per pixel reduce the bias. These losses are useful where outliers would
-dominate ``l2``. Losses that couple pixels are in `image_losses`.
+`frozen`). It is therefore unbiased if f' is linear in I, as for ``l2``, ``relative-l2`` and ``display-l2``. Noise in I
+biases the gradients of the other losses, and more samples per pixel reduce the bias. These losses are useful where
+outliers would dominate ``l2``. Losses that couple pixels are in `image_losses`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ Loss: TypeAlias = "Callable[..., mi.TensorXf]"
 # Floor (radiance) that is added to the denominators of relative losses: about 1 % of display white.
 RELATIVE_FLOOR = 1e-2
 
+# Radiance below which the weights of `display_l2` are constant.
+DISPLAY_FLOOR = 1e-2
+
 
 def l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
     """Compute ``|I - T|``. Noise in I biases the gradient."""
@@ -43,6 +46,15 @@ def l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 def relative_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
     """Compute ``((I - T) / (|T| + floor))²``, which emphasises dark regions. The gradient is unbiased."""
     return dr.square((image - target) / (dr.abs(target) + RELATIVE_FLOOR))
+
+
+def display_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+    """Compute ((I - T) s'(T))², where s' is the derivative of the sRGB encoding at T, clamped to [0.01, 1].
+
+    To first order, this is the squared difference of images on a display. The gradient is unbiased, as for ``l2``.
+    """
+    slope = (1.055 / 2.4) * dr.power(dr.clip(target, DISPLAY_FLOOR, 1), 1 / 2.4 - 1)
+    return dr.square((image - target) * slope)
 
 
 def log(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
@@ -65,7 +77,7 @@ def smape(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 #: Losses whose derivative with respect to a pixel is a linear function of that pixel alone.
-QUADRATIC = frozenset({l2, relative_l2})
+QUADRATIC = frozenset({l2, relative_l2, display_l2})
 
 #: Losses that take the pixel weights of `mean_loss` as a third argument.
 WEIGHTED = frozenset({scale_invariant})
@@ -78,6 +90,7 @@ LOSSES: dict[str, Loss] = {
     "l2": l2,
     "relative-l1": relative_l1,
     "relative-l2": relative_l2,
+    "display-l2": display_l2,
     "smape": smape,
     "log": log,
     "scale-invariant": scale_invariant,

@@ -30,6 +30,8 @@ from pathreplay.inverse.objective.pixel_batches import Batch, obstacle, refused
 from pathreplay.inverse.parameters.exposures import EXPOSURE, factor_of
 from pathreplay.inverse.parameters.exposures import gradient as exposure_gradient
 from pathreplay.inverse.parameters.gauss_newton import GaussNewton
+from pathreplay.inverse.parameters.response import RESPONSE, linearized
+from pathreplay.inverse.parameters.response import gradient as response_gradient
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem, scene_values, sensor_of
 from pathreplay.platform import memory
@@ -259,7 +261,7 @@ class Evaluator:
         try:
             factor = factor_of(values, view, about.target.shape[2])
             batch = None if pixels is None else Batch.of(about.weight, about.target.shape[:2], pixels, seed)
-            loss, by_factor = self._differentiated(view, seed, spp, factor, batch)
+            loss, by_factor, by_target = self._differentiated(values, view, seed, spp, factor, batch)
         except NotRecordable:  # a part of the gradient may have been added: start again from zero
             self.freezes = False
             return self._view(values, view, seed, spp, pixels)
@@ -270,6 +272,8 @@ class Evaluator:
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
+        if by_target is not None:
+            gradients[RESPONSE] = response_gradient(values, about.target, np.array(by_target))
         # One bad path must not end a long run. A sum is finite only if all entries are, and needs no temporary array.
         broken = [key for key, gradient in gradients.items() if not np.isfinite(gradient.sum(dtype=np.float64))]
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
@@ -279,14 +283,14 @@ class Evaluator:
         return Evaluation(loss, gradients, dropped, self._learned)
 
     def _differentiated(
-        self, view: int, seed: int, spp: int, factor: Array | None, batch: Batch | None
-    ) -> tuple[float, mi.TensorXf | None]:
-        """Return the view's contribution to the loss, and the derivative with respect to its ``factor``.
+        self, values: Arrays, view: int, seed: int, spp: int, factor: Array | None, batch: Batch | None
+    ) -> tuple[float, mi.TensorXf | None, mi.TensorXf | None]:
+        """Return the view's contribution to the loss, and the derivatives with respect to ``factor`` and target.
 
         The gradients of scene parameters are accumulated in the parameters themselves.
         """
         problem, about = self.problem, self.problem.views[view]
-        sensor, picture, counts = about.sensor, about.target, about.weight
+        sensor, picture, counts = about.sensor, linearized(values, about.target), about.weight
         if batch is not None:
             picture, counts = batch.rows(picture), None if counts is None else batch.rows(counts)
         others = (None if part is None else owned_tensor(part) for part in (counts, factor))
@@ -302,10 +306,17 @@ class Evaluator:
         # Seeds are inputs of recorded passes. Other passes take plain integers, which avoids reads from the device.
         number = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         request = RenderRequest(sensor, number, spp, batch)
-        loss = ViewLoss(problem.loss, about.share / len(problem.trained()), self._sweeps[which], problem.debias)
+        loss = ViewLoss(
+            problem.loss,
+            about.share / len(problem.trained()),
+            self._sweeps[which],
+            EXPOSURE in self._moving,
+            RESPONSE in self._moving,
+            problem.debias,
+        )
         problem.disk.rest()
         with plain_errors():
             step = self._recordings[spp].differentiate if records else differentiate
             found = step(problem.params, problem.scene, self.integrator, request, target, loss)
         self.integrator.keep(problem.scene, found.state)
-        return float(found.loss[0]) if dr.width(found.loss) else float("nan"), found.by_factor
+        return float(found.loss[0]) if dr.width(found.loss) else float("nan"), found.by_factor, found.by_target

@@ -71,6 +71,10 @@ class ViewLoss:
     share: float
     swept: bool
     """Whether one pass computes image and gradient, which requires a quadratic loss."""
+    by_factor: bool = True
+    """Whether the derivative with respect to `ViewTarget.factor` is computed, which needs a second image."""
+    by_target: bool = False
+    """Whether the derivative with respect to the target is computed, for quadratic losses."""
     debias: bool = False
     """Whether the bias due to noise is removed to first order: see `_extrapolated`."""
 
@@ -83,6 +87,8 @@ class ViewResult:
     state: PassState
     by_factor: mi.TensorXf | None
     """Derivative with respect to the logarithm of `ViewTarget.factor`, per channel."""
+    by_target: mi.TensorXf | None = None
+    """Derivative with respect to the target, at fixed weights of a relative loss."""
 
 
 class NotRecordable(Exception):
@@ -199,11 +205,15 @@ def _differentiate(
             apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # the seed that `mi.render` would use
             state = integrator.gradient_pass(apart, reduce(add, map(dr.grad, images)), state)
     by_factor = None
-    if factor is not None:
+    if factor is not None and loss.by_factor:
         other = mi.sample_tea_32(mi.UInt32(view.seed), mi.UInt32(int(Stream.SECOND_IMAGE)))[0]
         again = integrator.image_pass(replace(view, seed=other), state)
         by_factor = derivative(loss.loss, image, again, factor, target.target, target.weight) * share
-    return ViewResult(dr.detach(value), state, by_factor)
+    by_target = None
+    if loss.by_target:
+        offset, slope = linear_derivative(loss.loss, target.target, target.weight)
+        by_target = -share * (offset + slope * _times(dr.detach(image), factor))
+    return ViewResult(dr.detach(value), state, by_factor, by_target)
 
 
 def _halves(view: Pass) -> list[Pass]:

@@ -12,6 +12,7 @@ from pathreplay.integrators.film.image import picture_shape
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.objective.stages import Part, parts_of, require_single_pixels, require_stages
 from pathreplay.inverse.parameters.exposures import EXPOSURE
+from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.problem.problem import Problem, scene_values, variables_of
 
 
@@ -36,7 +37,7 @@ def require_reached(problem: Problem) -> None:
         where = f"stages: stage {part.number + 1}: " if part.stage else ""
         views = part.problem.trained()
         reached = sorted(views.keys() & part.problem.reached(part.moving))
-        if not reached and EXPOSURE not in part.moving:  # an exposure scales every image
+        if not reached and part.moving.isdisjoint({EXPOSURE, RESPONSE}):  # these change the comparison of every image
             names = _listed(view.name for view in views.values())
             raise PathreplayError(
                 f"{where}{_listed(sorted(part.problem.moves(part.moving)))} affects none of the training views "

@@ -17,6 +17,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.losses.pixelwise import Loss, mean_loss
 from pathreplay.inverse.parameters.reparameterization import Transform
+from pathreplay.inverse.parameters.response import linearized, stored
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 EXPOSURE = "exposure"
@@ -71,9 +72,9 @@ def factor_of(values: Arrays, view: int, channels: int) -> Image | None:
 
 
 def exposed(values: Arrays, view: int, picture: Image) -> Image:
-    """Multiply the image of a view by its factor."""
+    """Multiply the image of a view by its factor, and apply the response of the camera."""
     factor = factor_of(values, view, picture.shape[2])
-    return picture if factor is None else picture * factor
+    return stored(values, picture if factor is None else picture * factor)
 
 
 def derivative(
@@ -137,7 +138,7 @@ def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Imag
     """
     rows = values[EXPOSURE].copy()
     for view, (picture, target, weight) in pictures.items():
-        rows[view] = fitted(picture, target, weight, rows.shape[1] > 1)
+        rows[view] = fitted(picture, linearized(values, target), weight, rows.shape[1] > 1)
     return {**values, EXPOSURE: rows}
 
 

@@ -24,13 +24,14 @@ from pathreplay.inverse.parameters.pose import PART_NAMES, Pose, make_pose
 from pathreplay.inverse.parameters.pyramid import Pyramid
 from pathreplay.inverse.parameters.regularizers import Laplacian, Own, Penalty, Prior, Term, TotalVariation
 from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
+from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.values import Array, make_heights, make_value, require_finite_array, seen
 from pathreplay.platform import compat
 from pathreplay.scenes import parameters
 from pathreplay.scenes.parameters import SceneValue
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
 
-RESERVED = frozenset({EXPOSURE, "__metadata__"})
+RESERVED = frozenset({EXPOSURE, RESPONSE, "__metadata__"})
 """Keys with a special meaning in files of saved values. Parameters that have a ``shape`` cannot use them."""
 
 

@@ -9,6 +9,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.parameters.exposures import EXPOSURE
+from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.variables import Variable
 from pathreplay.inverse.problem.problem import Problem
 
@@ -60,8 +61,8 @@ def joined(parts: Sequence[Problem], config: Config) -> JointProblem:
                     f"'{variable.key}' has the shape {variable.start.shape} in one problem and {shape} in another; "
                     "only parameters of one shape are shared"
                 )
-    if EXPOSURE in variables or any(part.baseline is not None for part in parts):
-        raise PathreplayError("Joint problems support neither 'exposure' nor 'baseline'; remove them")
+    if not variables.keys().isdisjoint({EXPOSURE, RESPONSE}) or any(part.baseline is not None for part in parts):
+        raise PathreplayError("Joint problems support none of 'exposure', 'response' and 'baseline'; remove them")
     if len({id(part.scene) for part in parts}) < len(parts):
         raise PathreplayError("Two of the problems have the same scene; use one problem with several views")
     views = [replace(view, name=f"{n}-{view.name}") for n, part in enumerate(parts) for view in part.views]

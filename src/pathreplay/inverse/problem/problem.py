@@ -23,7 +23,7 @@ from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import TARGET, Config
 from pathreplay.inverse.config.tables import Plugin
 from pathreplay.inverse.config.user_functions import Modules
-from pathreplay.inverse.dataset.capture import Shot, fingerprint, read_capture
+from pathreplay.inverse.dataset.capture import Shot, fingerprint, put_inside, read_capture
 from pathreplay.inverse.dataset.targets import (
     Reading,
     Targets,
@@ -48,6 +48,10 @@ from pathreplay.inverse.parameters.exposures import EXPOSURE, Factors, fixed_row
 from pathreplay.inverse.parameters.exposures import start as start_of_exposures
 from pathreplay.inverse.parameters.grids import rmse
 from pathreplay.inverse.parameters.pose import Pose
+from pathreplay.inverse.parameters.reparameterization import Transform
+from pathreplay.inverse.parameters.response import RESPONSE
+from pathreplay.inverse.parameters.response import coordinates as coordinates_of_response
+from pathreplay.inverse.parameters.response import start as start_of_response
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import Variable, free_of, keys_of, make_variables
 from pathreplay.inverse.problem import feasibility
@@ -294,7 +298,7 @@ def build_problem(
         View(name, index, targets.images[name], targets.weights.get(name), name in test_views, shares[name])
         for name, index in sensors.items()
     )
-    unsolved += _exposures(scene, config, views)
+    unsolved += _exposures(scene, config, views) + _response(config)
     for view in views:
         feasibility.require_finite_loss(loss, view.name, view.target, view.weight)
         disk.rest()
@@ -321,6 +325,8 @@ def _loaded(
     wanted += [entry.key for entry in config.derived]
     cameras = {name: shot.camera for name, shot in shots.items()}
     scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
+    if config.capture is not None and config.capture.medium is not None:
+        put_inside(scene, set(shots), config.capture.medium)
     config, differences = completed(config, scene, given.integrator)
     return scene, config, notes + differences
 
@@ -385,6 +391,16 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
     fixed = fixed_rows([view.name for view in views], trained, reference, not options.fix_scale)
     rate = options.learning_rate or config.learning_rate
     return [Variable(EXPOSURE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=Factors(fixed))]
+
+
+def _response(config: Config) -> list[Variable]:
+    """Return a list that contains the variable of the camera response, or an empty list if the job has none."""
+    if (options := config.response) is None:
+        return []
+    value = start_of_response(None if options.kind == "gamma" else options.segments)
+    curve = Transform("log") if options.kind == "gamma" else coordinates_of_response(value, options.fix_exponent)
+    rate = options.learning_rate or config.learning_rate
+    return [Variable(RESPONSE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=curve)]
 
 
 def _pictures(

@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.vertex import Arrival, Flight, NullCollision, TraceConfig, reciprocal
-from pathreplay.transport.volume.media import Media, carried, interaction, is_grid, majorant, span
+from pathreplay.transport.volume.media import Grid, Media, carried, interaction, is_grid, majorant, span
 
 # Number of points of a flight at which its transmittance is differentiated. Fewer points increase the variance, more
 # points take more time. Four give the lowest variance at equal time for the cloud of `pathreplay bench media`.
@@ -80,7 +80,7 @@ def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, acti
                 if dr.hint(grid.emission is not None, mode="scalar"):
                     glows = inside & is_grid(grid, medium)
                     c = mi.Spectrum(W * dr.rcp(σ_bar))
-                    E = dr.select(glows, E + c * dr.detach(grid.emission_at(mei, glows)), E)
+                    E = _emission_added(grid, mei, E, c, glows)
                     count = dr.select(glows, count + 1, count)
                     picked = glows & (sampler.next_1d(glows) * count < 1)
                     t_emit = dr.select(picked, t_next, t_emit)
@@ -101,6 +101,7 @@ def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, acti
             bare = dr.select(kept, share / m, bare)
         if dr.hint(media.chromatic, mode="scalar"):
             W = dr.select(flying, W * (1 - σ_t / σ_bar) * reciprocal(1 - p), W)
+        E = _emission_at_end(media, mei, E, W * σ_t * dr.rcp(p * σ_bar), real)
         event |= real
         density = dr.select(real, p * σ_bar, density)
         p_real = dr.select(real, p, p_real)
@@ -114,6 +115,26 @@ def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, acti
     if dr.hint(trace.branch, mode="scalar"):
         flight.p, flight.null = p_real, NullCollision(t_null, ω_null, bare, mass, nulls, sampler.next_1d(active))
     return flight
+
+
+def _emission_added(
+    grid: Grid, mei: mi.MediumInteraction3f, E: mi.Spectrum, c: mi.Spectrum, active: mi.Bool
+) -> mi.Spectrum:
+    """Add the emission at a tentative collision, which is the estimate for emission per unit length."""
+    if grid.emission_per_extinction:
+        return E
+    return dr.select(active, E + c * dr.detach(grid.emission_at(mei, active)), E)
+
+
+def _emission_at_end(
+    media: Media, mei: mi.MediumInteraction3f, E: mi.Spectrum, c: mi.Spectrum, real: mi.Bool
+) -> mi.Spectrum:
+    """Return the emission at a real collision in media that emit per extinction: little noise if they are opaque."""
+    for grid in media.grids:
+        if grid.emission is not None and grid.emission_per_extinction:
+            glows = real & is_grid(grid, mei.medium)
+            E = dr.select(glows, c * dr.detach(grid.emission_at(mei, glows)), E)
+    return E
 
 
 def _tentative(
@@ -196,36 +217,86 @@ def fly_again(
         σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))
     w_event = σ_s * stretch * dr.rcp(flight.density)
     w = dr.select(event, w_event, 1) * flight.W
-    e = mi.Spectrum(0)
+    e, T = mi.Spectrum(0), mi.Spectrum(1)
     if dr.grad_enabled(σ_y, length):
         log_T = dr.select(through, -length / POINTS * sum(σ_y), 0)
         w *= dr.replace_grad(mi.Spectrum(1), log_T)
+        T = dr.replace_grad(T, log_T)
         if trace.baseline is not None:
             σ_bar = majorant(medium, ray, in_medium)
             guesses = [σ * _guess(trace, y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
             score = dr.select(through, length / POINTS * sum(guesses), 0)
-            score -= dr.select(event, σ_t * stretch * dr.rcp(flight.density) * _guess(trace, mei, σ_t, σ_bar, event), 0)
+            scored = event
+            for grid in trace.media.grids:
+                if _scores_at_collisions(trace, grid):
+                    scored &= ~is_grid(grid, medium)
+            score -= dr.select(
+                scored, σ_t * stretch * dr.rcp(flight.density) * _guess(trace, mei, σ_t, σ_bar, event), 0
+            )
             e += score - dr.detach(score)
 
     if trace.media.emissive:
-        emitted = mi.Spectrum(0)
-        for grid in trace.media.grids:
-            if grid.emission is not None:
-                glows = in_medium & is_grid(grid, medium) & (flight.t_emit > 0)
-                with dr.suspend_grad(when=not attached):
-                    t, J = flight.t_emit, mi.Float(1)
-                    if attached:
-                        t, J = carried(t, a, b, glows)
-                    length = dr.select(glows, t - a, 0)
-                    at_e = interaction(medium, ray, t)
-                    at_y = interaction(medium, ray, a + flight.along * length)
-                ε = grid.emission_at(at_e, glows) * flight.c_emit * J
-                _, _, σ_here = medium.get_scattering_coefficients(at_y, glows)
-                if dr.grad_enabled(σ_here, length):
-                    ε *= dr.replace_grad(mi.Spectrum(1), -length * σ_here)
-                emitted += dr.select(glows, ε, 0)
-        e += dr.replace_grad(flight.E, emitted)
+        e += dr.replace_grad(flight.E, _emission_again(trace, at, flight, (a, b), mei, T, attached, in_medium))
     return Flown(mei=mei, w=w, e=e)
+
+
+def _emission_again(
+    trace: TraceConfig,
+    at: Arrival,
+    flight: Flight,
+    ends: tuple[mi.Float, mi.Float],
+    mei: mi.MediumInteraction3f,
+    T: mi.Spectrum,
+    attached: bool,
+    in_medium: mi.Bool,
+) -> mi.Spectrum:
+    """Return the emission along a flight; only its derivative is meaningful.
+
+    Emission per length is differentiated at one tentative collision, with the transmittance up to there. Emission per
+    extinction, ∫ T σ B ds, has three derivatives. Those of B and of the transmittance (``T``: 1, with its derivative
+    up to the end of the flight) are estimated at the real collision. That of σ is estimated at a tentative collision,
+    where σ may be zero.
+    """
+    medium, ray, (a, b) = at.medium, at.ray, ends
+    emitted = mi.Spectrum(0)
+    for grid in trace.media.grids:
+        if grid.emission is None:
+            continue
+        glows = in_medium & is_grid(grid, medium) & (flight.t_emit > 0)
+        with dr.suspend_grad(when=not attached):
+            t, J = flight.t_emit, mi.Float(1)
+            if attached:
+                t, J = carried(t, a, b, glows)
+            length = dr.select(glows, t - a, 0)
+            at_e = interaction(medium, ray, t)
+            at_y = interaction(medium, ray, a + flight.along * length)
+        ε = grid.emission_at(at_e, glows)
+        if grid.emission_per_extinction:
+            σ_e = medium.get_scattering_coefficients(at_e, glows)[2]
+            value = dr.detach(ε)
+            if _scores_at_collisions(trace, grid):
+                value -= _guess(trace, at_e, σ_e, majorant(medium, ray, glows), glows)
+            emitted += dr.select(glows, value * σ_e * flight.c_emit * J, 0)
+            real = in_medium & flight.event & is_grid(grid, medium)
+            c = flight.W * dr.detach(medium.get_scattering_coefficients(mei, real)[2]) * dr.rcp(flight.density)
+            emitted += dr.select(real, T * c * grid.emission_at(mei, real), 0)
+            continue
+        ε *= flight.c_emit * J
+        _, _, σ_here = medium.get_scattering_coefficients(at_y, glows)
+        if dr.grad_enabled(σ_here, length):
+            ε *= dr.replace_grad(mi.Spectrum(1), -length * σ_here)
+        emitted += dr.select(glows, ε, 0)
+    return emitted
+
+
+def _scores_at_collisions(trace: TraceConfig, grid: Grid) -> bool:
+    """Return whether the control variate subtracts the score of a tentative collision instead of the real one.
+
+    The derivative of emission per extinction by σ is estimated at this tentative collision: their noise cancels.
+    """
+    return (
+        trace.baseline is not None and not trace.branch and grid.emission is not None and grid.emission_per_extinction
+    )
 
 
 def _guess(

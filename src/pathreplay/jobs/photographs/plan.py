@@ -1,0 +1,88 @@
+"""Plans the stages of a job, coarse to fine, for a machine's speed and a time limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+EVAL_SPP = 16
+VIEWS = 8
+"""Training views per iteration, half as many at full resolution."""
+SAMPLES = 160_000
+"""Samples per iteration, with 1 to `MOST_SPP` per pixel: many noisy steps go further than a few exact ones."""
+MOST_SPP = 4
+SHARES = {8: 0.1, 4: 0.2, 2: 0.3, 1: 0.4}
+"""Fraction of the time for each stage, by the factor by which images are reduced."""
+RESOLUTION = 0.75
+"""Voxels along the longest side of the region, per pixel along the longer side of an image."""
+FINEST = 160
+COARSEST = 16
+LEAST, MOST = 40, 1500
+"""Smallest and largest number of iterations of a stage."""
+PASSES = 5.0
+"""Time of an iteration per sample, relative to rendering an image: image, record, reverse sweep, second image."""
+A_VIEW = 0.03
+"""Seconds per view and iteration that do not depend on the number of samples."""
+USED = 0.75
+"""Fraction of the time limit that the plan uses, without rendering of test views and writing."""
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """A stage: iterations, reduction of the images, resolution of grids, factor on learning rates."""
+
+    iterations: int
+    downscale: int
+    resolution: int
+    views: int
+    spp: int
+    first: bool
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The stages of a job."""
+
+    stages: list[StagePlan]
+    name: str
+    """Path of the job."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Speed of a machine on a scene."""
+
+    samples: float
+    """Samples of an image per second."""
+    tracing: float
+    """Seconds to trace the kernels of a view once."""
+
+
+def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: int, name: str) -> Plan:
+    """Choose the stages that fit into a time limit.
+
+    A stage with less than `LEAST` iterations is left out, and its time goes to the others; the first stage stays.
+
+    Args:
+        speed: speed of the machine.
+        minutes: time limit.
+        trained: number of training views.
+        width: width of the images in pixels.
+        height: height of the images in pixels.
+        name: path of the job.
+    """
+    seconds, shares = 60 * minutes * USED, dict(SHARES)
+    while True:
+        left = max(seconds - len(shares) * 2 * trained * speed.tracing, 0.0)
+        stages = []
+        for k, (factor, share) in enumerate(shares.items()):
+            pixels = (width // factor) * (height // factor)
+            views = min(VIEWS if factor > 1 else VIEWS // 2, trained)
+            spp = min(max(round(SAMPLES / (views * pixels)), 1), MOST_SPP)
+            step = views * (A_VIEW + spp * PASSES * pixels / speed.samples)
+            size = min(max(round(RESOLUTION * max(width, height) / factor), COARSEST), FINEST)
+            count = int(left * share / sum(shares.values()) / step)
+            stages.append(StagePlan(count, factor, size, views, spp, k == 0 and len(shares) > 1))
+        if stages[-1].iterations >= LEAST or len(shares) == 1:
+            break
+        del shares[stages[-1].downscale]
+    return Plan([replace(s, iterations=min(max(s.iterations, LEAST), MOST)) for s in stages], name)

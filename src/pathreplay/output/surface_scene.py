@@ -1,0 +1,160 @@
+"""Exports an emissive density grid that a run has recovered as a scene for plain Mitsuba: a mesh that emits light."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import safetensors.numpy
+import scipy.ndimage
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.dataset.capture import read_capture
+from pathreplay.inverse.images.io import exr_bytes, picture_size
+from pathreplay.output.surfaces import surface
+from pathreplay.platform import backend
+from pathreplay.platform.atomic_files import whole_folder
+from pathreplay.runs.run_folder import Job, read_job, require_writable_name
+from pathreplay.scenes.loading import load_scene
+from pathreplay.types import SceneDict
+
+DENSITY, RADIANCE, SKY = ".sigma_t.data", ".radiance.data", "sky.data"
+THICKNESS = 2.0
+"""Number of voxels over which the density at the surface has an optical depth of 1."""
+DEPTH = 0.75
+"""Depth below the surface, in voxels, at which its colour is read."""
+
+
+def export_surface(run: Path, output: Path | None = None) -> str:
+    """Export the surface of a recovered density grid, with its radiance as a colour per vertex.
+
+    The folder contains `scene.xml`, which Mitsuba renders with `path` and without this package, the mesh as PLY, and
+    the sky. The mesh has the places where the optical depth of `THICKNESS` voxels is 1; fainter parts are left out.
+
+    Args:
+        run: run folder of a job that recovered `sigma_t` and `radiance` of one `gridmedium`.
+        output: new folder; default: ``surface`` in the run folder.
+
+    Returns:
+        Lines for the user.
+
+    Raises:
+        PathreplayError: the run has no such result, or no part of the grid is dense enough.
+    """
+    folder = run / "surface" if output is None else output
+    require_writable_name(run, "RUN")
+    require_writable_name(folder, "-o")
+    job = read_job(run)
+    backend.set_variant(job.config.variant)
+    path = run / "parameters.safetensors"
+    if not path.is_file():
+        raise PathreplayError(f"Run {run} has no result yet (no {path.name}); resume it")
+    values = safetensors.numpy.load_file(str(path))
+    density, radiance = (
+        next((value for key, value in values.items() if key.endswith(ending)), None) for ending in (DENSITY, RADIANCE)
+    )
+    if density is None or radiance is None:
+        raise PathreplayError(f"Run {run} recovered no density grid with a radiance; use pathreplay export")
+    low, size = _placed(job)
+    mesh = emitting_mesh(density[..., 0], radiance, low, size)
+    if not mesh.face_count():
+        raise PathreplayError(f"The density grid of run {run} is empty; run more iterations")
+    with whole_folder(folder, "-o") as part:
+        mesh.write_ply(str(part / "surface.ply"))
+        if SKY in values:
+            (part / "sky.exr").write_bytes(exr_bytes(values[SKY]))
+        (part / "scene.xml").write_text(surface_xml(_cameras(job), SKY in values))
+    scene = folder / "scene.xml"
+    return (
+        f"{scene}: {mesh.face_count()} triangles that emit light; render it with "
+        f"`pathreplay render {shlex.quote(str(scene))} -o scene.exr --sensor 0`, or open it in Mitsuba"
+    )
+
+
+def _placed(job: Job) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower corner and the size of the box of the medium."""
+    scene = load_scene(job.config.scene, job.base, **job.config.scene_parameters)
+    boxes = [shape.bbox() for shape in scene.shapes() if shape.interior_medium() is not None]
+    if len(boxes) != 1:
+        raise PathreplayError(f"Scene {job.config.scene} has {len(boxes)} shapes with a medium; export one of them")
+    return np.array(boxes[0].min, np.float64).ravel(), np.array(boxes[0].extents(), np.float64).ravel()
+
+
+def emitting_mesh(density: np.ndarray, radiance: np.ndarray, low: np.ndarray, size: np.ndarray) -> mi.Mesh:
+    """Make the mesh of a grid, with the vertex attribute ``vertex_color``.
+
+    Args:
+        density: extinction per length, shape (z, y, x).
+        radiance: radiance of an optically thick medium, shape (z, y, x, 3).
+        low: lower corner of the grid in world space.
+        size: size of the grid in world space.
+    """
+    voxel = size / density.shape[::-1]
+    level = 1 / (THICKNESS * float(voxel.mean()))
+    points, triangles = surface(density, level)
+    slopes = np.stack([_at(component, points) for component in np.gradient(density)][::-1], axis=1)
+    lengths = np.linalg.norm(slopes, axis=1, keepdims=True)
+    inner = points + DEPTH * np.divide(slopes, lengths, out=np.zeros_like(slopes), where=lengths > 0)
+    colours = np.stack([_at(radiance[..., k], inner) for k in range(3)], axis=1)
+    mesh = mi.Mesh("surface", len(points), len(triangles))
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = mi.Float((low + (points + 0.5) * voxel).astype(np.float32).ravel())
+    params["faces"] = mi.UInt32(triangles.astype(np.uint32).ravel())
+    params.update()
+    mesh.add_attribute("vertex_color", 3, np.maximum(colours, 0).astype(np.float32).ravel())
+    return mesh
+
+
+def _at(values: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Interpolate a grid (z, y, x) at points (x, y, z)."""
+    return scipy.ndimage.map_coordinates(values.astype(np.float64), points[:, ::-1].T, order=1, mode="nearest")
+
+
+def _cameras(job: Job) -> list[SceneDict]:
+    if job.config.capture is None:
+        return []
+    return [shot.camera for shot in read_capture(job.config.capture, job.base, picture_size).values()]
+
+
+def surface_xml(cameras: Iterable[SceneDict], has_sky: bool) -> str:
+    """Return the scene of `surface.ply`, which emits its vertex colours, with cameras and possibly `sky.exr`."""
+    sky = (
+        '  <emitter type="envmap" id="sky">\n    <string name="filename" value="sky.exr"/>\n  </emitter>\n'
+        if has_sky
+        else ""
+    )
+    return (
+        '<scene version="3.0.0">\n'
+        '  <integrator type="path">\n    <integer name="max_depth" value="1"/>\n  </integrator>\n'
+        + "".join(map(_sensor, cameras))
+        + '  <shape type="ply" id="surface">\n'
+        '    <string name="filename" value="surface.ply"/>\n'
+        '    <bsdf type="diffuse">\n      <rgb name="reflectance" value="0"/>\n    </bsdf>\n'
+        '    <emitter type="area">\n'
+        '      <texture type="mesh_attribute" name="radiance">\n'
+        '        <string name="name" value="vertex_color"/>\n'
+        "      </texture>\n"
+        "    </emitter>\n"
+        "  </shape>\n" + sky + "</scene>\n"
+    )
+
+
+def _sensor(camera: SceneDict) -> str:
+    film = camera["film"]
+    matrix = " ".join(f"{x:.9g}" for x in np.array(camera["to_world"].matrix).ravel())
+    numbers = "".join(
+        f'    <float name="{name}" value="{camera[name]:.9g}"/>\n'
+        for name in ("fov", "near_clip", "far_clip", "principal_point_offset_x", "principal_point_offset_y")
+    )
+    return (
+        f'  <sensor type="perspective" id="{camera["id"]}">\n    <string name="fov_axis" value="x"/>\n{numbers}'
+        f'    <transform name="to_world">\n      <matrix value="{matrix}"/>\n    </transform>\n'
+        '    <film type="hdrfilm">\n'
+        f'      <integer name="width" value="{film["width"]}"/>\n'
+        f'      <integer name="height" value="{film["height"]}"/>\n'
+        '      <string name="pixel_format" value="rgb"/>\n      <rfilter type="box"/>\n    </film>\n'
+        "  </sensor>\n"
+    )

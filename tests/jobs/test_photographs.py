@@ -1,0 +1,185 @@
+"""Jobs from photographs: what is read, what is written, what is refused, and a run from the first to the last file."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import pathreplay
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.schema import load_config
+from pathreplay.inverse.dataset.photos import Photo
+from pathreplay.inverse.dataset.undistortion import Lens
+from pathreplay.inverse.images.io import exr_bytes, png_bytes
+from pathreplay.jobs.photographs.pictures import BLOCK, frames_of, prepare
+from pathreplay.jobs.photographs.plan import LEAST, Speed, plan_stages
+from pathreplay.jobs.photographs.reading import find_photos
+from pathreplay.jobs.photographs.region import find_region
+from pathreplay.output.surface_scene import export_surface
+
+VIEWS, SIZE, FOV = 10, 32, 0.75
+
+
+def cameras() -> list[np.ndarray]:
+    """Camera to world, in OpenGL's axes, around the point (1, 0, 0)."""
+    placed = []
+    for k in range(VIEWS):
+        y = 0.85 * (1 - 2 * (k + 0.5) / VIEWS)
+        turn, r = k * math.pi * (3 - math.sqrt(5)), math.sqrt(1 - y * y)
+        back = np.array([r * math.cos(turn), y, r * math.sin(turn)])
+        right = np.cross([0, 1, 0], back)
+        right /= np.linalg.norm(right)
+        matrix = np.eye(4)
+        matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = right, np.cross(back, right), back
+        matrix[:3, 3] = 4 * back + np.array([1, 0, 0])
+        placed.append(matrix)
+    return placed
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photos of a striped ball at (1, 0, 0) in front of a grey sky."""
+    folder = tmp_path_factory.mktemp("capture")
+    stripes = np.where(np.arange(8)[None, :, None] % 2, [0.9, 0.2, 0.1], [0.1, 0.3, 0.8]) * np.ones((4, 1, 1))
+    ball = {"type": "sphere", "center": [1, 0, 0], "emitter": {
+        "type": "area", "radiance": {"type": "bitmap", "bitmap": mi.Bitmap(stripes.astype(np.float32)), "raw": True,
+                                     "filter_type": "nearest"}}}  # fmt: skip
+    scene = mi.load_dict({"type": "scene", "ball": ball, "sky": {"type": "constant", "radiance": 0.4}})
+    frames = []
+    for k, matrix in enumerate(cameras()):
+        film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+        place = mi.ScalarTransform4f((matrix @ np.diag([-1.0, 1, -1, 1])).tolist())
+        camera = mi.load_dict({"type": "perspective", "fov": math.degrees(FOV), "to_world": place, "film": film})
+        integrator = mi.load_dict({"type": "path", "max_depth": 1})
+        image = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=64, seed=k))
+        (folder / f"{k}.png").write_bytes(png_bytes(image))
+        frames.append({"file_path": f"{k}.png", "transform_matrix": matrix.tolist()})
+    write(folder, frames)
+    return folder
+
+
+def write(folder: Path, frames: list[dict[str, Any]]) -> None:
+    table = {"camera_angle_x": FOV, "w": SIZE, "h": SIZE, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(table))
+
+
+def test_a_job_is_written(capture: Path, tmp_path: Path) -> None:
+    written = pathreplay.from_photos(capture, tmp_path / "job", minutes=1.0)
+    config = load_config(written.job)
+    assert config.capture is not None
+    assert config.capture.test_every == 5
+    assert {entry.key.split(".")[-2] for entry in config.parameters} == {"sigma_t", "radiance", "sky"}
+    assert (written.folder / "images" / "view_3.png").is_file()
+    assert not (written.folder / "masks").exists()
+    scene = mi.load_file(str(written.folder / "scene.xml"))
+    box = scene.shapes()[0].bbox()
+    assert (np.array(box.min) < [0, -1, -1]).all()
+    assert (np.array(box.max) > [2, 1, 1]).all()
+
+
+def test_the_region_is_what_cameras_see(capture: Path) -> None:
+    region = find_region(frames_of(find_photos(capture).photos, None))
+    np.testing.assert_allclose(region.centre, [1, 0, 0], atol=0.4)
+    assert (region.size > 2).all()
+    assert (region.size < 6.5).all()
+
+
+def test_frames_without_an_image_are_left_out(capture: Path, tmp_path: Path) -> None:
+    frames = [{"file_path": str(capture / f"{k}.png"), "transform_matrix": m.tolist()} for k, m in enumerate(cameras())]
+    write(tmp_path, [*frames, {**frames[0], "file_path": "lost.png"}])
+    found = find_photos(tmp_path)
+    assert len(found.photos) == VIEWS
+    assert "lost.png" in found.notes()[0]
+    write(tmp_path, [{**frames[0], "file_path": "lost.png"}, *frames[:2]])
+    with pytest.raises(PathreplayError, match="2 of 3 images exist; add the image files"):
+        find_photos(tmp_path)
+
+
+def test_what_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(PathreplayError, match=r"neither transforms.json nor a COLMAP model .* recover the poses"):
+        find_photos(tmp_path)
+    with pytest.raises(PathreplayError, match="No folder"):
+        find_photos(tmp_path / "nowhere")
+    (tmp_path / "a.stl").write_bytes(b"")
+    for options, told in [
+        ({"minutes": -1.0}, "minutes is -1.0"),
+        ({"test_every": 1}, "test_every is 1"),
+        ({"width": 4}, "width is 4"),
+    ]:
+        with pytest.raises(PathreplayError, match=told):
+            pathreplay.from_photos(tmp_path, tmp_path / "job", **options)
+    assert not (tmp_path / "job").exists()
+
+
+def test_no_mesh_of_another_kind(capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.stl").write_bytes(b"")
+    with pytest.raises(PathreplayError, match="is not a PLY or OBJ file"):
+        pathreplay.from_photos(capture, tmp_path / "job", mesh=tmp_path / "a.stl")
+
+
+def test_a_given_mesh_gets_a_reflectance(capture: Path, tmp_path: Path) -> None:
+    mi.load_dict({"type": "cube"}).write_ply(str(tmp_path / "cube.ply"))
+    written = pathreplay.from_photos(capture, tmp_path / "job", mesh=tmp_path / "cube.ply", minutes=0.01)
+    params = mi.traverse(mi.load_file(str(written.folder / "scene.xml")))
+    keys = [entry.key for entry in load_config(written.job).parameters]
+    assert set(keys) <= set(params.keys())
+    assert any("reflectance" in key or "vertex_color" in key for key in keys)
+
+
+def test_prepared_images_are_those_of_a_pinhole(tmp_path: Path) -> None:
+    """A photo of a distorting lens with oblong pixels, of a pattern whose undistorted image is known."""
+    lens = Lens(160, 120, 150.0, 165.0, 84.0, 58.0, (0.08, -0.03, 0.0, 0.0, 0.0, 0.0), (0.002, -0.001))
+
+    def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.stack([0.5 + 0.4 * np.sin(9 * x), 0.5 + 0.4 * np.cos(7 * y), 0.5 + 0.3 * x * y], axis=-1)
+
+    u, v = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
+    x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
+    x0, y0 = x.copy(), y.copy()
+    for _ in range(50):  # the point of the plane whose distorted image is the pixel
+        bent = lens.bent(x, y)
+        x, y = x + x0 - bent[0], y + y0 - bent[1]
+    (tmp_path / "a.exr").write_bytes(exr_bytes(pattern(x, y).astype(np.float32)))
+    photo = Photo("a", "a.exr", tmp_path / "a.exr", None, lens, np.eye(4))
+    (frame,) = frames_of([photo], 80)
+    prepared = prepare(photo, frame)
+    assert prepared.image.shape == (frame.height, frame.width, 3)
+    assert frame.width % BLOCK == frame.height % BLOCK == 0
+    u, v = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
+    expected = pattern((u - frame.cx) / frame.focal, (v - frame.cy) / frame.focal)
+    inside = np.ones(u.shape, bool) if prepared.weight is None else prepared.weight[:, :, 0] > 0.99
+    assert inside.mean() > 0.8
+    assert np.abs(prepared.image - expected)[inside].max() < 0.03
+
+
+def test_stages_fit_into_the_time() -> None:
+    speed = Speed(samples=1e6, tracing=0.1)
+    plan = plan_stages(speed, 30, 40, 160, 280, "job.toml")
+    assert [stage.downscale for stage in plan.stages] == [8, 4, 2, 1]
+    assert [stage.first for stage in plan.stages] == [True, False, False, False]
+    resolutions = [stage.resolution for stage in plan.stages]
+    assert resolutions == sorted(set(resolutions))
+    short = plan_stages(speed, 0.2, 40, 160, 280, "job.toml")
+    assert len(short.stages) < len(plan.stages)
+    assert all(stage.iterations >= LEAST for stage in plan.stages + short.stages)
+
+
+@pytest.mark.slow
+def test_from_photos_to_a_mesh(capture: Path, tmp_path: Path) -> None:
+    """Test views come close to the photos, and plain Mitsuba shows the ball."""
+    written = pathreplay.from_photos(capture, tmp_path / "job", minutes=3.0)
+    result = pathreplay.optimize(written.job, output=tmp_path / "run", progress=False)
+    rows = json.loads((result.folder / "views.json").read_text())
+    print(result.describe())
+    assert rows
+    export_surface(result.folder)
+    scene = mi.load_file(str(result.folder / "surface" / "scene.xml"))
+    image = np.array(mi.render(scene, sensor=1, spp=16))
+    target = np.array(mi.Bitmap(str(result.folder / "images" / "target-view_1.exr")))
+    assert np.abs(image - target).mean() < 0.15
