@@ -11,7 +11,14 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.stateful import StatefulIntegrator
 from pathreplay.inverse.config.schema import ITERATION, make_config
 from pathreplay.inverse.loop.loop import new_run
-from pathreplay.inverse.losses.pixelwise import QUADRATIC, RELATIVE_FLOOR, l2
+from pathreplay.inverse.losses.pixelwise import (
+    DISPLAY_FLOOR,
+    QUADRATIC,
+    RELATIVE_FLOOR,
+    display_l2,
+    l2,
+    relative_l2,
+)
 from pathreplay.inverse.objective.evaluate import Evaluator, Shard
 from pathreplay.inverse.objective.frozen import linear_derivative
 from pathreplay.inverse.problem.problem import build_problem
@@ -160,7 +167,9 @@ def test_the_derivative_of_a_quadratic_loss_is_found_at_any_brightness() -> None
     for loss in QUADRATIC:
         offset, slope = (np.array(term, dtype=np.float64) for term in linear_derivative(loss, target))
         T = np.array(target, dtype=np.float64)
-        weight = 2 / T.size if loss is l2 else 2 / T.size / (T + RELATIVE_FLOOR) ** 2
+        slopes = {l2: 1, relative_l2: 1 / (T + RELATIVE_FLOOR)}
+        slopes[display_l2] = 1.055 / 2.4 * np.clip(T, DISPLAY_FLOOR, 1) ** (1 / 2.4 - 1)
+        weight = 2 / T.size * slopes[loss] ** 2
         np.testing.assert_allclose(slope, weight, rtol=1e-5)
         np.testing.assert_allclose(offset, -weight * T, rtol=1e-5)
 
