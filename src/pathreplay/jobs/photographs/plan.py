@@ -14,7 +14,7 @@ SHARES = {8: 0.1, 4: 0.2, 2: 0.3, 1: 0.4}
 """Fraction of the time for each stage, by the factor by which images are reduced."""
 RESOLUTION = 0.75
 """Voxels along the longest side of the region, per pixel along the longer side of an image."""
-FINEST = 160
+FINEST = 128
 COARSEST = 16
 LEAST, MOST = 40, 1500
 """Smallest and largest number of iterations of a stage."""
@@ -22,6 +22,10 @@ PASSES = 5.0
 """Time of an iteration per sample, relative to rendering an image: image, record, reverse sweep, second image."""
 A_VIEW = 0.03
 """Seconds per view and iteration that do not depend on the number of samples."""
+VALUES = 4
+"""Numbers per voxel."""
+A_VALUE, A_VALUE_OF_VIEW = 60e-9, 15e-9
+"""Seconds per number of the grids and iteration, and in addition per view."""
 USED = 0.75
 """Fraction of the time limit that the plan uses, without rendering of test views and writing."""
 
@@ -80,6 +84,7 @@ def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: 
             spp = min(max(round(SAMPLES / (views * pixels)), 1), MOST_SPP)
             step = views * (A_VIEW + spp * PASSES * pixels / speed.samples)
             size = min(max(round(RESOLUTION * max(width, height) / factor), COARSEST), FINEST)
+            step += VALUES * size**3 * (A_VALUE + views * A_VALUE_OF_VIEW)
             count = int(left * share / sum(shares.values()) / step)
             stages.append(StagePlan(count, factor, size, views, spp, k == 0 and len(shares) > 1))
         if stages[-1].iterations >= LEAST or len(shares) == 1:
