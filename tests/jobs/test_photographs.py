@@ -159,7 +159,7 @@ def test_prepared_images_are_those_of_a_pinhole(tmp_path: Path) -> None:
 
 
 def test_stages_fit_into_the_time() -> None:
-    speed = Speed(samples=1e6, tracing=0.1)
+    speed = Speed(samples=1e6, tracing=0.05, compiling=1.0)
     plan = plan_stages(speed, 30, 40, 160, 280, "job.toml")
     assert [stage.downscale for stage in plan.stages] == [8, 4, 2, 1]
     assert [stage.first for stage in plan.stages] == [True, False, False, False]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -176,18 +176,21 @@ def _write_start(folder: Path, region: Box, mean: np.ndarray, proxy: Proxy | Non
 
 
 def measure(scene: Path, frames: Sequence[Frame], near: float) -> Speed:
-    """Measure how fast this machine renders a scene from one of the cameras."""
-    frame = frames[len(frames) // 2]
-    camera = camera_of(frame, near)
-    loaded = load_scene(scene)
-    sensor = mi.load_dict(camera)
-    times = []
-    for seed in range(3):
+    """Measure how fast this machine renders a scene from one of the cameras: tracing, compiling, and samples."""
+    frame, loaded = frames[len(frames) // 2], load_scene(scene)
+
+    def seconds(sensor: mi.Sensor, spp: int, seed: int) -> float:
         begin = time.perf_counter()
-        np.array(mi.render(loaded, sensor=sensor, integrator=loaded.integrator(), spp=TIMED_SPP, seed=seed))
-        times.append(time.perf_counter() - begin)
-    warm = min(times[1:])
-    return Speed(frame.width * frame.height * TIMED_SPP / warm, max(times[0] - warm, 0.05))
+        np.array(mi.render(loaded, sensor=sensor, integrator=loaded.integrator(), spp=spp, seed=seed))
+        return time.perf_counter() - begin
+
+    large = mi.load_dict(camera_of(frame, near))
+    small = mi.load_dict(camera_of(replace(frame, width=8, height=8), near))
+    first = seconds(small, 1, 0)
+    traced = min(seconds(small, 1, seed) for seed in (1, 2, 3))
+    whole = min(seconds(large, TIMED_SPP, seed) for seed in (1, 2, 3))
+    samples = frame.width * frame.height * TIMED_SPP / max(whole - traced, 0.1 * whole)
+    return Speed(samples, traced, max(first - traced, 0.0))
 
 
 def camera_of(frame: Frame, near: float) -> Json:

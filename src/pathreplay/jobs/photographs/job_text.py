@@ -168,7 +168,7 @@ lower = 0.0
 upper = {brightest:.3g}
 resolutions = [{sizes}]
 learning_rate = 0.1
-# total_variation = 0.001            # smoother, if few photographs see each point
+total_variation = 0.01               # smoother surfaces
 """,
     ]
 

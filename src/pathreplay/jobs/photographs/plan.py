@@ -24,8 +24,10 @@ A_VIEW = 0.03
 """Seconds per view and iteration that do not depend on the number of samples."""
 VALUES = 4
 """Numbers per voxel."""
-A_VALUE, A_VALUE_OF_VIEW = 60e-9, 15e-9
+A_VALUE, A_VALUE_OF_VIEW = 40e-9, 6e-9
 """Seconds per number of the grids and iteration, and in addition per view."""
+TRACED = 4.0
+"""Kernels of an iteration, relative to those of an image. Each view is traced twice per stage."""
 USED = 0.75
 """Fraction of the time limit that the plan uses, without rendering of test views and writing."""
 
@@ -58,7 +60,9 @@ class Speed:
     samples: float
     """Samples of an image per second."""
     tracing: float
-    """Seconds to trace the kernels of a view once."""
+    """Seconds to trace an image."""
+    compiling: float
+    """Seconds to compile the kernels of an image, once per stage."""
 
 
 def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: int, name: str) -> Plan:
@@ -76,7 +80,8 @@ def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: 
     """
     seconds, shares = 60 * minutes * USED, dict(SHARES)
     while True:
-        left = max(seconds - len(shares) * 2 * trained * speed.tracing, 0.0)
+        overhead = TRACED * (2 * trained * speed.tracing + speed.compiling)
+        left = max(seconds - len(shares) * overhead, 0.0)
         stages = []
         for k, (factor, share) in enumerate(shares.items()):
             pixels = (width // factor) * (height // factor)
