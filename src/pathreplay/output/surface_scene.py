@@ -22,8 +22,10 @@ from pathreplay.scenes.loading import load_scene
 from pathreplay.types import SceneDict
 
 DENSITY, RADIANCE, SKY = ".sigma_t.data", ".radiance.data", "sky.data"
-THICKNESS = 2.0
+THICKNESS = 6.0
 """Number of voxels over which the density at the surface has an optical depth of 1."""
+SMOOTH = 1.0
+"""Standard deviation of the Gaussian with which noise of the grids is removed, in voxels."""
 DEPTH = 0.75
 """Depth below the surface, in voxels, at which its colour is read."""
 
@@ -94,11 +96,14 @@ def emitting_mesh(density: np.ndarray, radiance: np.ndarray, low: np.ndarray, si
     """
     voxel = size / density.shape[::-1]
     level = 1 / (THICKNESS * float(voxel.mean()))
-    points, triangles = surface(density, level)
-    slopes = np.stack([_at(component, points) for component in np.gradient(density)][::-1], axis=1)
+    smooth = scipy.ndimage.gaussian_filter(density, SMOOTH)
+    emitted = scipy.ndimage.gaussian_filter(density[..., None] * radiance, (SMOOTH, SMOOTH, SMOOTH, 0))
+    points, triangles = surface(smooth, level)
+    slopes = np.stack([_at(component, points) for component in np.gradient(smooth)][::-1], axis=1)
     lengths = np.linalg.norm(slopes, axis=1, keepdims=True)
     inner = points + DEPTH * np.divide(slopes, lengths, out=np.zeros_like(slopes), where=lengths > 0)
-    colours = np.stack([_at(radiance[..., k], inner) for k in range(3)], axis=1)
+    weight = np.maximum(_at(smooth, inner), 1e-6 * level)  # dense voxels determine the colour
+    colours = np.stack([_at(emitted[..., k], inner) / weight for k in range(3)], axis=1)
     mesh = mi.Mesh("surface", len(points), len(triangles))
     params = mi.traverse(mesh)
     params["vertex_positions"] = mi.Float((low + (points + 0.5) * voxel).astype(np.float32).ravel())
