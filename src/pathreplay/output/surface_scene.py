@@ -22,10 +22,10 @@ from pathreplay.scenes.loading import load_scene
 from pathreplay.types import SceneDict
 
 DENSITY, RADIANCE, SKY = ".sigma_t.data", ".radiance.data", "sky.data"
-THICKNESS = 6.0
+THICKNESS = 8.0
 """Number of voxels over which the density at the surface has an optical depth of 1."""
-SMOOTH = 1.0
-"""Standard deviation of the Gaussian with which noise of the grids is removed, in voxels."""
+SMOOTH, SMOOTH_COLOUR = 1.0, 0.5
+"""Standard deviations of the Gaussians with which noise of density and colours is removed, in voxels."""
 DEPTH = 0.75
 """Depth below the surface, in voxels, at which its colour is read."""
 
@@ -97,12 +97,13 @@ def emitting_mesh(density: np.ndarray, radiance: np.ndarray, low: np.ndarray, si
     voxel = size / density.shape[::-1]
     level = 1 / (THICKNESS * float(voxel.mean()))
     smooth = scipy.ndimage.gaussian_filter(density, SMOOTH)
-    emitted = scipy.ndimage.gaussian_filter(density[..., None] * radiance, (SMOOTH, SMOOTH, SMOOTH, 0))
+    thick = scipy.ndimage.gaussian_filter(density, SMOOTH_COLOUR)
+    emitted = scipy.ndimage.gaussian_filter(density[..., None] * radiance, (*3 * (SMOOTH_COLOUR,), 0))
     points, triangles = surface(smooth, level)
     slopes = np.stack([_at(component, points) for component in np.gradient(smooth)][::-1], axis=1)
     lengths = np.linalg.norm(slopes, axis=1, keepdims=True)
     inner = points + DEPTH * np.divide(slopes, lengths, out=np.zeros_like(slopes), where=lengths > 0)
-    weight = np.maximum(_at(smooth, inner), 1e-6 * level)  # dense voxels determine the colour
+    weight = np.maximum(_at(thick, inner), 1e-6 * level)  # dense voxels determine the colour
     colours = np.stack([_at(emitted[..., k], inner) / weight for k in range(3)], axis=1)
     mesh = mi.Mesh("surface", len(points), len(triangles))
     params = mi.traverse(mesh)
