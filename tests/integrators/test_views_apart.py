@@ -116,7 +116,7 @@ def test_cameras_that_no_view_has_are_told_before_the_first_iteration(changes: d
 
 def test_the_only_stage_of_a_job_is_named_too() -> None:
     job = {key: value for key, value in LEFT.items() if key != "iterations"}
-    with pytest.raises(PathreplayError, match=r"^stages: stage 1: 'left.to_world' reaches none"):
+    with pytest.raises(PathreplayError, match=r"^stages: stage 1: 'left.to_world' affects none"):
         optimize(make_config({**job, "stages": [{"iterations": 2, "sensors": ["right"]}]}), progress=False)
 
 

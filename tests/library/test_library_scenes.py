@@ -128,7 +128,7 @@ def test_what_scenes_cannot_share_is_told() -> None:
     for problems, words in (
         ([one, two], "have the same scene"),
         ([coarse, fine], "shape"),
-        ([one, exposed], "neither 'exposure' nor 'baseline'"),
+        ([one, exposed], "none of 'exposure', 'response' and 'baseline'"),
         ([], "problems: there are none"),
     ):
         with pytest.raises(PathreplayError, match=words) as told:

@@ -15,7 +15,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.capture import read_capture
 from pathreplay.inverse.images.io import exr_bytes, picture_size
 from pathreplay.output.surfaces import surface
-from pathreplay.platform import backend
+from pathreplay.platform import backend, compat
 from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.runs.run_folder import Job, read_job, require_writable_name
 from pathreplay.scenes.loading import load_scene
@@ -105,11 +105,7 @@ def emitting_mesh(density: np.ndarray, radiance: np.ndarray, low: np.ndarray, si
     inner = points + DEPTH * np.divide(slopes, lengths, out=np.zeros_like(slopes), where=lengths > 0)
     weight = np.maximum(_at(thick, inner), 1e-6 * level)  # dense voxels determine the colour
     colours = np.stack([_at(emitted[..., k], inner) / weight for k in range(3)], axis=1)
-    mesh = mi.Mesh("surface", len(points), len(triangles))
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = mi.Float((low + (points + 0.5) * voxel).astype(np.float32).ravel())
-    params["faces"] = mi.UInt32(triangles.astype(np.uint32).ravel())
-    params.update()
+    mesh = compat.new_mesh(low + (points + 0.5) * voxel, triangles, mi.Properties(), flat=True)
     mesh.add_attribute("vertex_color", 3, np.maximum(colours, 0).astype(np.float32).ravel())
     return mesh
 
