@@ -62,7 +62,7 @@ def export_run(run: Path, output: Path | None = None) -> str:
     require_writable_name(folder, _OPTION)
     job = read_job(run)
     backend.set_variant(job.config.variant)
-    values = _result(run)
+    values = run_result(run)
     source = _source(job, values)
     photographic = {key: values.pop(key) for key in (EXPOSURE, RESPONSE) if key in values}
     free = {entry.key: values.pop(entry.key) for entry in job.config.parameters if entry.shape is not None}
@@ -95,7 +95,7 @@ def write_files(export: Exported, folder: Path) -> None:
             raise PathreplayError(f"File {path} of the scene cannot be copied ({error.strerror})") from error
 
 
-def _result(run: Path) -> dict[str, np.ndarray]:
+def run_result(run: Path) -> dict[str, np.ndarray]:
     """Return the decoded parameter values at the end of a run. Raises PathreplayError if the run has no result."""
     path = run / "parameters.safetensors"
     if not path.is_file():

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-import safetensors.numpy
 import scipy.ndimage
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.capture import read_capture
 from pathreplay.inverse.images.io import exr_bytes, picture_size
+from pathreplay.output.export import run_result
 from pathreplay.output.surfaces import surface
 from pathreplay.platform import backend, compat
 from pathreplay.platform.atomic_files import whole_folder
@@ -51,10 +51,7 @@ def export_surface(run: Path, output: Path | None = None) -> str:
     require_writable_name(folder, "-o")
     job = read_job(run)
     backend.set_variant(job.config.variant)
-    path = run / "parameters.safetensors"
-    if not path.is_file():
-        raise PathreplayError(f"Run {run} has no result yet (no {path.name}); resume it")
-    values = safetensors.numpy.load_file(str(path))
+    values = run_result(run)
     density, radiance = (
         next((value for key, value in values.items() if key.endswith(ending)), None) for ending in (DENSITY, RADIANCE)
     )

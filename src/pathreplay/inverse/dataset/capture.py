@@ -121,15 +121,31 @@ def _camera(photo: Photo, size: tuple[int, int], capture: Capture, pixel_format:
         raise PathreplayError(f"{photo.where} has a transform_matrix that is not a rigid motion; correct it")
     columns = size[0] if capture.width is None else capture.width
     rows = max(1, round(columns * size[1] / size[0]))
+    return pinhole_camera(lens, photo.place, (columns, rows), capture.near_clip, pixel_format)
+
+
+def pinhole_camera(
+    lens: Lens, place: np.ndarray, size: tuple[int, int], near_clip: float, pixel_format: str = "rgb"
+) -> SceneDict:
+    """Make the Mitsuba dictionary of a camera without distortion.
+
+    Args:
+        lens: focal length, principal point and image size in pixels of the photo. Its distortion is ignored.
+        place: camera-to-world matrix (4 x 4), in the OpenGL convention.
+        size: width and height of the film.
+        near_clip: near clipping distance.
+        pixel_format: pixel format of the film.
+    """
+    columns, rows = size
     return {
         "type": "perspective",
         "fov": math.degrees(2 * math.atan(lens.w / (2 * lens.fx))),
         "fov_axis": "x",
-        "near_clip": capture.near_clip,
+        "near_clip": near_clip,
         "far_clip": 1e5,
         "principal_point_offset_x": 0.5 - lens.cx / lens.w,
         "principal_point_offset_y": 0.5 - lens.cy / lens.h,
-        "to_world": mi.ScalarTransform4f((photo.place @ FACING).tolist()),
+        "to_world": mi.ScalarTransform4f((place @ FACING).tolist()),
         "film": {
             "type": "hdrfilm",
             "width": columns,

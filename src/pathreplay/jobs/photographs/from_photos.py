@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.inverse.dataset.capture import FACING
+from pathreplay.inverse.dataset.capture import pinhole_camera
 from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.jobs.photographs.job_text import SKY_SIZE, Choices, field_scene, job_text, mesh_scene
 from pathreplay.jobs.photographs.mesh import GREY, Proxy, read_proxy
@@ -23,7 +23,6 @@ from pathreplay.jobs.photographs.region import Box, find_region, near_clip
 from pathreplay.platform import backend
 from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.scenes.loading import load_scene
-from pathreplay.types import Json
 
 JOB = "job.toml"
 OPTICAL_DEPTH = 1.5
@@ -184,26 +183,12 @@ def measure(scene: Path, frames: Sequence[Frame], near: float) -> Speed:
         np.array(mi.render(loaded, sensor=sensor, integrator=loaded.integrator(), spp=spp, seed=seed))
         return time.perf_counter() - begin
 
-    large = mi.load_dict(camera_of(frame, near))
-    small = mi.load_dict(camera_of(replace(frame, width=8, height=8), near))
+    large, small = (
+        mi.load_dict(pinhole_camera(frame.lens, frame.place, size, near))
+        for size in ((frame.width, frame.height), (8, 8))
+    )
     first = seconds(small, 1, 0)
     traced = min(seconds(small, 1, seed) for seed in (1, 2, 3))
     whole = min(seconds(large, TIMED_SPP, seed) for seed in (1, 2, 3))
     samples = frame.width * frame.height * TIMED_SPP / max(whole - traced, 0.1 * whole)
     return Speed(samples, traced, max(first - traced, 0.0))
-
-
-def camera_of(frame: Frame, near: float) -> Json:
-    """Return the Mitsuba dictionary of a frame's camera."""
-    film = {"type": "hdrfilm", "width": frame.width, "height": frame.height, "pixel_format": "rgb"}
-    return {
-        "type": "perspective",
-        "fov": float(np.degrees(2 * np.arctan(frame.width / (2 * frame.focal)))),
-        "fov_axis": "x",
-        "near_clip": near,
-        "far_clip": 1e5,
-        "principal_point_offset_x": 0.5 - frame.cx / frame.width,
-        "principal_point_offset_y": 0.5 - frame.cy / frame.height,
-        "to_world": mi.ScalarTransform4f((frame.place @ FACING).tolist()),
-        "film": {**film, "rfilter": {"type": "box"}},
-    }

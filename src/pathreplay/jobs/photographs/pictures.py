@@ -47,6 +47,11 @@ class Frame:
     place: np.ndarray
     """4 x 4 camera-to-world matrix in the OpenGL convention."""
 
+    @property
+    def lens(self) -> Lens:
+        """The camera as a lens without distortion."""
+        return Lens(self.width, self.height, self.focal, self.focal, self.cx, self.cy)
+
 
 @dataclass(frozen=True)
 class Prepared:
