@@ -96,9 +96,25 @@ class Lens:
         """
         height, width, _ = image.shape
         u, v = np.meshgrid((np.arange(width) + 0.5) * self.w / width, (np.arange(height) + 0.5) * self.h / height)
-        x, y, valid = self.bent((u - self.cx) / self.fx, (v - self.cy) / self.fx)
-        column = (self.fx * x + self.cx) * width / self.w - 0.5
-        row = (self.fy * y + self.cy) * height / self.h - 0.5
+        sampled, mask = self.sampled(image, (u - self.cx) / self.fx, (v - self.cy) / self.fx, (width, height))
+        return sampled * mask, mask
+
+    def sampled(self, image: Image, x: np.ndarray, y: np.ndarray, extent: tuple[float, float]) -> tuple[Image, Image]:
+        """Interpolate a distorted image where a pinhole camera sees the directions (x, y, 1).
+
+        Args:
+            image: the distorted image, shape (height, width, channels).
+            x: slopes of the directions, an array of shape (rows, columns).
+            y: the same vertically.
+            extent: width and height in pixels of ``image`` that correspond to ``w`` and ``h``.
+
+        Returns:
+            The values, and a mask that is 1 where the image has data, shape (rows, columns, 1).
+        """
+        height, width, _ = image.shape
+        x, y, valid = self.bent(x, y)
+        column = (self.fx * x + self.cx) * extent[0] / self.w - 0.5
+        row = (self.fy * y + self.cy) * extent[1] / self.h - 0.5
         with np.errstate(invalid="ignore"):
             valid &= (column >= -0.5) & (column <= width - 0.5) & (row >= -0.5) & (row <= height - 0.5)
         coordinates = np.where(valid, row, 0.0), np.where(valid, column, 0.0)
@@ -106,5 +122,4 @@ class Lens:
             scipy.ndimage.map_coordinates(image[:, :, i], coordinates, order=1, mode="nearest", output=np.float32)
             for i in range(image.shape[2])
         ]
-        mask = valid[:, :, None].astype(np.float32)
-        return np.stack(planes, axis=2) * mask, mask
+        return np.stack(planes, axis=2), valid[:, :, None].astype(np.float32)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import PIL.Image
-import scipy.ndimage
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.capture import view_names
@@ -146,18 +145,8 @@ def _resampled(image: Image, lens: Lens, frame: Frame) -> tuple[Image, Image]:
     """Resample an image to a pinhole camera; return it with a mask of the pixels that have data."""
     coarse = max(1, int(lens.fx / frame.focal * image.shape[1] / lens.w))
     rows, columns = (n // coarse * coarse for n in image.shape[:2])
-    scale = np.array([image.shape[1] / lens.w, image.shape[0] / lens.h]) / coarse  # pixels of `small` per unit of lens
     blocks = image[:rows, :columns].reshape(rows // coarse, coarse, columns // coarse, coarse, -1)
     small = blocks.mean(axis=(1, 3), dtype=np.float32)
     u, v = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
-    x, y, valid = lens.bent((u - frame.cx) / frame.focal, (v - frame.cy) / frame.focal)
-    column, row = (lens.fx * x + lens.cx) * scale[0] - 0.5, (lens.fy * y + lens.cy) * scale[1] - 0.5
-    height, width = small.shape[:2]
-    with np.errstate(invalid="ignore"):
-        valid &= (column >= -0.5) & (column <= width - 0.5) & (row >= -0.5) & (row <= height - 0.5)
-    at = np.where(valid, row, 0.0), np.where(valid, column, 0.0)
-    planes = [
-        scipy.ndimage.map_coordinates(small[:, :, i], at, order=1, mode="nearest", output=np.float32)
-        for i in range(small.shape[2])
-    ]
-    return np.stack(planes, axis=2), valid[:, :, None].astype(np.float32)
+    extent = image.shape[1] / coarse, image.shape[0] / coarse
+    return lens.sampled(small, (u - frame.cx) / frame.focal, (v - frame.cy) / frame.focal, extent)
