@@ -41,7 +41,7 @@ COMPUTING = {"test_truth_media", "test_pixel_sweep", "test_replay_attached", "te
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
 TIMEOUT_S = 120
 #: Files that take longest, begun first, so that of several processes none is left alone with one of them.
-LONGEST = ("test_truth_edges_inner", "test_truth_edges", "test_truth_media", "test_edges_ordinary",
+LONGEST = ("test_hostile", "test_truth_edges_inner", "test_truth_edges", "test_truth_media", "test_edges_ordinary",
            "test_mitsuba_configs", "test_edges_in_use", "test_truth_edges_media", "test_pixel_sweep",
            "test_replay_attached", "test_ordinary_use", "test_primal_media", "test_truth_materials",
            "test_truth_attached", "test_baselines", "test_inverse_run", "test_motion_noise", "test_variants",

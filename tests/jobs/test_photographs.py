@@ -26,33 +26,60 @@ from pathreplay.output.surface_scene import export_surface
 VIEWS, SIZE, FOV = 10, 32, 0.75
 
 
+def looking(back: np.ndarray) -> np.ndarray:
+    """Camera to world, in OpenGL's axes, of a camera that looks at the point (1, 0, 0)."""
+    right = np.cross([0, 1, 0], back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = right, np.cross(back, right), back
+    matrix[:3, 3] = 4 * back + np.array([1, 0, 0])
+    return matrix
+
+
 def cameras() -> list[np.ndarray]:
-    """Camera to world, in OpenGL's axes, around the point (1, 0, 0)."""
-    placed = []
-    for k in range(VIEWS):
-        y = 0.85 * (1 - 2 * (k + 0.5) / VIEWS)
-        turn, r = k * math.pi * (3 - math.sqrt(5)), math.sqrt(1 - y * y)
-        back = np.array([r * math.cos(turn), y, r * math.sin(turn)])
-        right = np.cross([0, 1, 0], back)
-        right /= np.linalg.norm(right)
-        matrix = np.eye(4)
-        matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = right, np.cross(back, right), back
-        matrix[:3, 3] = 4 * back + np.array([1, 0, 0])
-        placed.append(matrix)
-    return placed
+    """Cameras on all sides."""
+    heights = [0.85 * (1 - 2 * (k + 0.5) / VIEWS) for k in range(VIEWS)]
+    turns = [k * math.pi * (3 - math.sqrt(5)) for k in range(VIEWS)]
+    return [
+        looking(np.array([math.sqrt(1 - y * y) * math.cos(turn), y, math.sqrt(1 - y * y) * math.sin(turn)]))
+        for y, turn in zip(heights, turns, strict=True)
+    ]
+
+
+def painted(colours: np.ndarray) -> dict[str, Any]:
+    """A lamp of many colours."""
+    bitmap = mi.Bitmap(colours.astype(np.float32))
+    return {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}}
+
+
+def striped_ball(radius: float) -> dict[str, Any]:
+    stripes = np.where(np.arange(8)[None, :, None] % 2, [0.9, 0.2, 0.1], [0.1, 0.3, 0.8]) * np.ones((4, 1, 1))
+    return {"type": "sphere", "center": [1, 0, 0], "radius": radius, "emitter": painted(stripes)}
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Photos of a striped ball at (1, 0, 0) in front of a grey sky."""
-    folder = tmp_path_factory.mktemp("capture")
-    stripes = np.where(np.arange(8)[None, :, None] % 2, [0.9, 0.2, 0.1], [0.1, 0.3, 0.8]) * np.ones((4, 1, 1))
-    ball = {"type": "sphere", "center": [1, 0, 0], "emitter": {
-        "type": "area", "radiance": {"type": "bitmap", "bitmap": mi.Bitmap(stripes.astype(np.float32)), "raw": True,
-                                     "filter_type": "nearest"}}}  # fmt: skip
-    scene = mi.load_dict({"type": "scene", "ball": ball, "sky": {"type": "constant", "radiance": 0.4}})
+    scene = {"type": "scene", "ball": striped_ball(1.0), "sky": {"type": "constant", "radiance": 0.4}}
+    return take_photos(scene, cameras(), tmp_path_factory.mktemp("capture"))
+
+
+@pytest.fixture(scope="module")
+def wall_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photos from one side of a striped ball in front of a wall of many colours."""
+    place = mi.ScalarTransform4f().translate([1, 0, -1.2]).scale([8, 8, 1])
+    paint = np.tile(np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 3)), (2, 2, 1))
+    wall = {"type": "rectangle", "to_world": place, "emitter": painted(paint)}
+    turns = [(math.radians(-45 + 90 * i / 4), math.radians(-20 + 20 * j)) for j in range(3) for i in range(5)]
+    backs = [(math.sin(a) * math.cos(e), math.sin(e), math.cos(a) * math.cos(e)) for a, e in turns]
+    scene = {"type": "scene", "ball": striped_ball(0.8), "wall": wall}
+    return take_photos(scene, [looking(np.array(back)) for back in backs], tmp_path_factory.mktemp("wall"))
+
+
+def take_photos(described: dict[str, Any], placed: list[np.ndarray], folder: Path) -> Path:
+    scene = mi.load_dict(described)
     frames = []
-    for k, matrix in enumerate(cameras()):
+    for k, matrix in enumerate(placed):
         film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
         place = mi.ScalarTransform4f((matrix @ np.diag([-1.0, 1, -1, 1])).tolist())
         camera = mi.load_dict({"type": "perspective", "fov": math.degrees(FOV), "to_world": place, "film": film})
@@ -171,16 +198,16 @@ def test_stages_fit_into_the_time() -> None:
 
 
 @pytest.mark.slow
-def test_from_photos_to_a_mesh(capture: Path, tmp_path: Path) -> None:
-    """Images come close to the photos, and plain Mitsuba shows the ball."""
-    written = pathreplay.from_photos(capture, tmp_path / "job", minutes=3.0)
+def test_from_photos_to_a_mesh(wall_capture: Path, tmp_path: Path) -> None:
+    """Images come close to the photos, and plain Mitsuba shows the ball in front of the wall."""
+    written = pathreplay.from_photos(wall_capture, tmp_path / "job", minutes=3.0)
     result = pathreplay.optimize(written.job, output=tmp_path / "run", progress=False)
     rows = json.loads((result.folder / "views.json").read_text()).values()
     print(result.describe())
-    assert [row["is_test"] for row in rows] == [True, False, False, False, False] * 2
+    assert [row["is_test"] for row in rows] == [True, False, False, False, False] * 3
     assert all(row["result"]["psnr"] > row["start"]["psnr"] + 4 for row in rows if not row["is_test"])
     export_surface(result.folder)
     scene = mi.load_file(str(result.folder / "surface" / "scene.xml"))
-    image = np.array(mi.render(scene, sensor=1, spp=16))
     target = np.array(mi.Bitmap(str(result.folder / "images" / "target-view_1.exr")))
-    assert np.abs(image - target).mean() < 0.15
+    spread = np.abs(target - target.mean((0, 1))).mean()
+    assert np.abs(np.array(mi.render(scene, sensor=1, spp=16)) - target).mean() < 0.8 * spread

@@ -12,7 +12,7 @@ import scipy.ndimage
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.capture import read_capture
-from pathreplay.inverse.images.io import exr_bytes, picture_size
+from pathreplay.inverse.images.io import encoded, exr_bytes, picture_size, read_image, with_channels
 from pathreplay.output.export import run_result
 from pathreplay.output.surfaces import surface
 from pathreplay.platform import backend, compat
@@ -22,19 +22,22 @@ from pathreplay.scenes.loading import load_scene
 from pathreplay.types import SceneDict
 
 DENSITY, RADIANCE, SKY = ".sigma_t.data", ".radiance.data", "sky.data"
-THICKNESS = 8.0
-"""Number of voxels over which the density at the surface has an optical depth of 1."""
-SMOOTH, SMOOTH_COLOUR = 1.0, 0.5
-"""Standard deviations of the Gaussians with which noise of density and colours is removed, in voxels."""
+THICKNESSES = (8.0, 4.0, 2.0, 1.0)
+"""Numbers of voxels over which the density at the surface has an optical depth of 1; the first is the default."""
 DEPTH = 0.75
 """Depth below the surface, in voxels, at which its colour is read."""
+COMPARED, SPP = 6, 16
+"""Number of views in which candidates are compared with the photos, and samples per pixel of their images."""
+SMOOTH, SMOOTH_COLOUR = 1.0, 0.5
+"""Standard deviations of the Gaussians with which noise of density and colours is removed, in voxels."""
 
 
 def export_surface(run: Path, output: Path | None = None) -> str:
     """Export the surface of a recovered density grid, with its radiance as a colour per vertex.
 
     The folder contains `scene.xml`, which Mitsuba renders with `path` and without this package, the mesh as PLY, and
-    the sky. The mesh has the places where the optical depth of `THICKNESS` voxels is 1; fainter parts are left out.
+    the sky. The density at the surface is the one of `THICKNESSES` whose images are closest to the photos in `COMPARED`
+    views, up to a factor per colour. Fainter parts of the grid are left out.
 
     Args:
         run: run folder of a job that recovered `sigma_t` and `radiance` of one `gridmedium`.
@@ -58,14 +61,26 @@ def export_surface(run: Path, output: Path | None = None) -> str:
     if density is None or radiance is None:
         raise PathreplayError(f"Run {run} recovered no density grid with a radiance; use pathreplay export")
     low, size = _placed(job)
-    mesh = emitting_mesh(density[..., 0], radiance, low, size)
-    if not mesh.face_count():
-        raise PathreplayError(f"The density grid of run {run} is empty; run more iterations")
+    cameras = _cameras(job)
+    views = _compared(run, cameras)
+    best: tuple[float, mi.Mesh] | None = None
     with whole_folder(folder, "-o") as part:
-        mesh.write_ply(str(part / "surface.ply"))
         if SKY in values:
             (part / "sky.exr").write_bytes(exr_bytes(values[SKY]))
-        (part / "scene.xml").write_text(surface_xml(_cameras(job), SKY in values))
+        for thickness in THICKNESSES if views else THICKNESSES[:1]:
+            mesh = emitting_mesh(density[..., 0], radiance, low, size, thickness)
+            if not mesh.face_count():
+                continue
+            mesh.write_ply(str(part / "surface.ply"))
+            (part / "scene.xml").write_text(surface_xml([camera for camera, _ in views], SKY in values))
+            error = _error(part / "scene.xml", [target for _, target in views])
+            if best is None or error < best[0]:
+                best = error, mesh
+        if best is None:
+            raise PathreplayError(f"The density grid of run {run} is empty; run more iterations")
+        mesh = best[1]
+        mesh.write_ply(str(part / "surface.ply"))
+        (part / "scene.xml").write_text(surface_xml(cameras, SKY in values))
     scene = folder / "scene.xml"
     return (
         f"{scene}: {mesh.face_count()} triangles that emit light; render it with "
@@ -82,7 +97,36 @@ def _placed(job: Job) -> tuple[np.ndarray, np.ndarray]:
     return np.array(boxes[0].min, np.float64).ravel(), np.array(boxes[0].extents(), np.float64).ravel()
 
 
-def emitting_mesh(density: np.ndarray, radiance: np.ndarray, low: np.ndarray, size: np.ndarray) -> mi.Mesh:
+def _compared(run: Path, cameras: list[SceneDict]) -> list[tuple[SceneDict, np.ndarray]]:
+    """Return cameras, evenly spaced in the capture, whose photos the run has saved, with these photos."""
+    found = [(camera, path) for camera in cameras if (path := run / "images" / f"target-{camera['id']}.exr").is_file()]
+    views = []
+    for camera, path in found[:: -(-len(found) // COMPARED) or 1]:
+        target = with_channels(read_image(path), 3)
+        if target is None:
+            continue
+        film = {**camera["film"], "width": target.shape[1], "height": target.shape[0]}
+        views.append(({**camera, "film": film}, target))
+    return views
+
+
+def _error(scene: Path, targets: list[np.ndarray]) -> float:
+    """Return the L1 error, as a display shows it, of images whose mean colours are adjusted to those of the targets."""
+    loaded, error = mi.load_file(str(scene)), 0.0
+    for k, target in enumerate(targets):
+        image = np.array(mi.render(loaded, sensor=k, spp=SPP))
+        gain = target.mean((0, 1)) / np.maximum(image.mean((0, 1)), 1e-6)
+        error += float(np.abs(encoded(gain * image) - encoded(target)).mean())
+    return error
+
+
+def emitting_mesh(
+    density: np.ndarray,
+    radiance: np.ndarray,
+    low: np.ndarray,
+    size: np.ndarray,
+    thickness: float = THICKNESSES[0],
+) -> mi.Mesh:
     """Make the mesh of a grid, with the vertex attribute ``vertex_color``.
 
     Args:
@@ -90,9 +134,10 @@ def emitting_mesh(density: np.ndarray, radiance: np.ndarray, low: np.ndarray, si
         radiance: radiance of an optically thick medium, shape (z, y, x, 3).
         low: lower corner of the grid in world space.
         size: size of the grid in world space.
+        thickness: number of voxels over which the density at the surface has an optical depth of 1.
     """
     voxel = size / density.shape[::-1]
-    level = 1 / (THICKNESS * float(voxel.mean()))
+    level = 1 / (thickness * float(voxel.mean()))
     smooth = scipy.ndimage.gaussian_filter(density, SMOOTH)
     thick = scipy.ndimage.gaussian_filter(density, SMOOTH_COLOUR)
     emitted = scipy.ndimage.gaussian_filter(density[..., None] * radiance, (*3 * (SMOOTH_COLOUR,), 0))
