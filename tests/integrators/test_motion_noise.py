@@ -114,7 +114,7 @@ def tails(g: np.ndarray) -> tuple[float, float]:
     return squares.max() / squares.sum(), g.std(ddof=1) / g[:FEW].std(ddof=1)
 
 
-QUICK = {"camera moves sideways in the Cornell box", "mesh turns under a sky"}
+QUICK = {"mesh turns under a sky"}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in SCENES])

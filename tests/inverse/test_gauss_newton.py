@@ -154,7 +154,8 @@ def test_a_job_ends_by_itself_with_a_tolerance(folder: Path) -> None:
         optimize(resume="run", progress=False)
 
 
-@pytest.mark.parametrize("case", ["lamp", pytest.param("pose", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["lamp", "pose"])
 def test_recorded_passes_and_shards_of_samples_are_the_same_model(case: str, folder: Path) -> None:
     """What the third evaluation replays is what the first has traced; and shards add up."""
     job = {**JOB, "target": {"values": {KEY: [0.3, 0.5, 0.1]}, "spp": 16}, "integrator": {"type": "pathreplay"}}

@@ -98,6 +98,7 @@ pathreplay.minimize(problem, steps=12, output={output!r}, resume=True, progress=
 """
 
 
+@pytest.mark.slow
 def test_a_script_that_was_killed_is_started_again_and_ends_with_the_same_bits() -> None:
     box = mi.cornell_box()
     box["sensor"]["film"].update(width=16, height=16)

@@ -96,7 +96,7 @@ def test_derivatives_are_those_of_central_differences(name: str, tmp_path: Path)
         assert np.sum(np.array(dr.grad(tensor)) * direction) == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize("name", JOBS)
+@pytest.mark.parametrize("name", [n if n == "lens" else pytest.param(n, marks=pytest.mark.slow) for n in JOBS])
 def test_the_loss_falls_from_the_transport(name: str, tmp_path: Path) -> None:
     config = job(name, tmp_path, iterations=20, spp=64, learning_rate=RATES[name], warmup_steps=4)
     result = optimize(make_config(config), progress=False)

@@ -113,7 +113,10 @@ SETUPS: dict[str, tuple[Any, dict[str, float], dict[str, float]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SETUPS)
+QUICK = {"lens", "mirror"}
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in SETUPS])
 def test_light_makes_the_picture(name: str) -> None:
     """By Mitsuba's particle tracer, which sees a caustic of collimated light."""
     rows, columns = 96, 128

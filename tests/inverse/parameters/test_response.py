@@ -165,6 +165,7 @@ def photographed(folder: Path) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_exposures_response_and_pose_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = optimize(make_config(photographed(tmp_path)), output=tmp_path / "run", progress=False)
