@@ -26,8 +26,8 @@ Which: TypeAlias = "int | mi.Sensor"
 class Rays:
     """The camera rays of a pass, one per sample of each pixel."""
 
-    sampler: Sampler  # positioned after the dimensions of the camera ray
-    ray: mi.RayDifferential3f  # attached to the camera, if the camera has gradients
+    sampler: Sampler  # has already generated the random numbers of the camera ray
+    ray: mi.RayDifferential3f  # attached to the camera if the camera has gradients
     weight: mi.Spectrum
     position: mi.Vector2f  # film position in pixels, where the sample is splatted
     spp: int  # samples per pixel of the pass, after rounding by the sampler
@@ -83,7 +83,7 @@ class Pass:
     sensor: mi.Sensor
     seed: Seed
     spp: int = 0
-    share: float = 1.0  # weight in the mean over the parts of a split pass: see `parts`
+    share: float = 1.0  # weight of this pass in a mean of images, if it is a part of a longer pass: see `parts`
     uses_sobol: bool = False
     # If set, film positions s move with the velocity v of the flow. The derivative of a camera ray c(s, π) with respect
     # to the parameters π is then ∂c/∂π + ∂c/∂s v, in place of ∂c/∂π: see `camera_flow`.
@@ -119,7 +119,10 @@ class Pass:
     def camera_ray(
         self, time: mi.Float, wavelength: mi.Float, position: mi.Point2f, aperture: mi.Point2f
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """Sample the sensor's ray and its weight (see Mitsuba's Sensor), attached to the camera or to the film flow."""
+        """Sample a ray of the sensor and the weight of the ray: see Mitsuba's `Sensor.sample_ray_differential`.
+
+        The ray is attached to the camera. With a ``flow``, the ray moves as described in `FilmFlow.ray`.
+        """
         if self.flow is not None:
             return self.flow.ray(Sample(time, wavelength, position, aperture))
         # Irradiance meters do not implement `sample_ray`.
@@ -128,14 +131,14 @@ class Pass:
     def sobol_sampler(
         self, pixel: mi.UInt32, width: int, path: mi.UInt32, paths: int, of: int | mi.UInt32 = 0
     ) -> OwenSobolSampler:
-        """Create the Sobol sampler of path number ``path`` of a pixel that has ``paths`` paths.
+        """Create the Sobol sampler of one path of a pixel.
 
-        ``pixel`` is a row-major index in a film of ``width`` pixels. Each value of ``of`` selects an independent set of
-        samples.
+        ``path`` is the index of the path in the pixel, which has ``paths`` paths in total. ``pixel`` is the row-major
+        index of the pixel in a film of ``width`` pixels. Samplers with different values of ``of`` are independent.
         """
         bits = (paths - 1).bit_length()
         morton = morton_index(pixel % width, pixel // width)
-        # If the index needs more than 32 bits, its leading bits and ``of`` together select the set of samples.
+        # The index has 32 bits. Excess leading bits select the set of samples, together with the seed and ``of``.
         overflow = morton >> (32 - bits) if bits else mi.UInt32(0)
         return OwenSobolSampler.of((morton << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), overflow))
 
@@ -148,7 +151,7 @@ class Pass:
         return seed
 
     def pixel_samples(self, pixel: mi.UInt32) -> PixelSamples:
-        """Create the samples for lanes that each trace all paths of a pixel. ``pixel`` contains row-major indices."""
+        """Create samplers for lanes that each trace all paths of one pixel. ``pixel`` contains row-major indices."""
         if self.uses_sobol:
             width, _ = self.size
             return SobolSets(partial(self.sobol_sampler, pixel, width))

@@ -1,4 +1,4 @@
-"""Messages about a pass: paths with an incomplete gradient, and causes of wrong gradients."""
+"""Messages about wrong or incomplete gradients of a pass, and about their causes."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
 
 
 def particle_notes(trace: TraceConfig, sensor: mi.Sensor) -> Iterator[str]:
-    """Yield messages about what the gradient of moving light paths does not contain."""
+    """Yield messages about derivatives of light paths that are missing from the gradient."""
     if sensor.film().rfilter().is_box_filter():
         yield (
             f"the film of sensor '{sensor.id()}' has a box filter, whose derivative is zero: the motion of light paths "
@@ -83,8 +83,8 @@ def particle_notes(trace: TraceConfig, sensor: mi.Sensor) -> Iterator[str]:
 def missing_edges(trace: TraceConfig, sensor: mi.Sensor, edges: str) -> tuple[str, bool]:
     """Format the message about moving edges whose boundary term is left out ("" if there is none to report).
 
-    ``edges`` is the value of the property ``boundary``. Also returns whether the message names the parameter that
-    moves.
+    ``edges`` is the value of the property ``boundary``. Also returns whether the message names a parameter that moves
+    edges.
     """
     moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
     if moving:

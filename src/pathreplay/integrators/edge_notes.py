@@ -10,21 +10,21 @@ import mitsuba as mi
 from pathreplay.platform import compat
 from pathreplay.scenes.parameters import needs_ray_adjoint
 
-# Parameters that move points of a surface. Other parameters with this effect have Mitsuba's flag `Discontinuous`.
+# Parameters that move points of a surface. All other parameters that do so have Mitsuba's flag `Discontinuous`.
 _POSITIONS = {*compat.POSITIONS, "to_world", "control_points"}
 
 
 def moves_edges(params: mi.SceneParameters, key: str) -> bool:
     """Return whether a parameter of ``mi.traverse(scene)`` moves silhouettes or shadows.
 
-    Parameters of shapes, of cameras, and of emitters that cast hard shadows can do so.
+    Parameters of shapes, of cameras, and of emitters that cast hard shadows can move them.
     """
     node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
     if isinstance(node, mi.Shape):
         marked = bool(params.flags(key) & mi.ParamFlags.Discontinuous) and name not in compat.NORMALS
         return name in _POSITIONS or marked
     if isinstance(node, mi.Emitter) and not mi.has_flag(node.flags(), mi.EmitterFlags.Delta):
-        return False  # an environment emitter
+        return False  # the emitter casts no hard shadows
     return needs_ray_adjoint(params, key)
 
 

@@ -81,25 +81,27 @@ class PathReplayIntegrator(PathIntegrator):
 
     Properties: see `PATH_REPLAY` in `integrators/properties.py`.
 
-    ``boundary = 'auto'`` means ``all`` if something that can occlude light moves (see `edges_move`) and its boundary
-    term can be computed, otherwise ``none``. The term cannot be computed with an ``attach`` other than ``delta``, for
-    sensors of type ``batch``, and in scenes with an ``sdfgrid``. For such a sensor or shape, a warning is logged.
-    Without motion, no boundary term is computed for any value of ``boundary``.
+    ``boundary = 'auto'`` means ``all`` if something that can occlude light moves (see `edges_move`) and the boundary
+    term can be computed. Otherwise ``auto`` means ``none``. The boundary term cannot be computed with an ``attach``
+    other than ``delta``, for sensors of type ``batch``, and in scenes with an ``sdfgrid``. For such a sensor or shape,
+    a warning is logged. Without motion, no boundary term is computed for any value of ``boundary``.
 
     Gradients of media use a control variate that this integrator learns from earlier gradient passes with other seeds.
     ``null_branching`` traces one more path from a null collision, as if the path had been scattered there. Without null
-    branching, the gradient with respect to extinction is wrong where extinction is zero. ``auto`` branches if
-    extinction with gradients varies in space or is zero. In these cases, branching usually also takes less time at
-    equal noise.
+    branching, the gradient with respect to extinction is wrong where extinction is zero. With
+    ``null_branching = 'auto'``, paths branch if extinction with gradients varies in space or is zero. In these cases,
+    branching usually also takes less time at equal noise.
 
-    Not differentiated: visibility that ``boundary`` leaves out; with ``attach='none'``, all motion of shapes, cameras
-    and directions; without ``null_branching``, extinction where it is zero; with ``adjoint='replay'``, weights that are
+    The integrator does not differentiate visibility that ``boundary`` leaves out. With ``attach='none'``, it does not
+    differentiate the motion of shapes, cameras and directions. Without ``null_branching``, it does not differentiate
+    extinction where the extinction is zero. With ``adjoint='replay'``, it does not differentiate weights that are
     exactly zero.
+
     Raises PathreplayError for unknown or unusable properties and in polarised variants.
     """
 
     name, properties = "pathreplay", declared.PATH_REPLAY
-    without_light_paths = "take caustics = 'camera'"  # remedy in error messages, if light paths are not supported
+    without_light_paths = "take caustics = 'camera'"  # remedy, for errors about unsupported light paths
     interior: PathReplay
 
     def __init__(self, props: mi.Properties) -> None:
@@ -138,11 +140,11 @@ class PathReplayIntegrator(PathIntegrator):
         return image if lit is None else image + lit
 
     def _camera_view(self, view: Pass) -> Pass:
-        """Return the pass of the camera paths."""
+        """Return the pass whose rays start camera paths. Here, it is ``view`` itself."""
         return view
 
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
-        """Build the trace configuration of camera paths. Caustics are omitted if light paths estimate them."""
+        """Build the trace configuration of camera paths, which omit caustics if light paths estimate caustics."""
         trace = PathIntegrator._trace_config(self, scene, sensor, state)
         if self.particles is None:
             return trace
@@ -173,10 +175,12 @@ class PathReplayIntegrator(PathIntegrator):
         return reduce(add, results)
 
     def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
-        """Add the film flow and its term. The other terms then differentiate motion that the flow does not contain.
+        """Return the pass with its film flow, its trace configuration, and the terms of its gradient.
 
-        If ``follow``, the flow may follow visible surfaces (`SurfaceFlow`). The boundary term is left out if no edge
-        moves or ``auto`` cannot compute it. The interior term is left out if the flow contains the whole derivative.
+        If the pass has a film flow, the terms include `FilmMotion`. The other terms then only differentiate motion that
+        the flow does not contain. With ``follow``, the flow may follow visible surfaces (`SurfaceFlow`). The boundary
+        term is left out if no edge moves, or if ``boundary = 'auto'`` and the term cannot be computed. The interior
+        term is left out if `FilmMotion` is the whole derivative.
         """
         view, trace, terms = PathIntegrator._planned(self, view, state)
         if self.boundary == "none":
@@ -200,7 +204,10 @@ class PathReplayIntegrator(PathIntegrator):
         return self.boundary != "primary" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
 
     def _needs_edges(self, view: Pass, trace: TraceConfig) -> bool:
-        """Return whether boundary terms are needed and, with ``auto``, available. Logs their cost or absence."""
+        """Return whether boundary terms are needed and, with ``boundary = 'auto'``, whether they can be computed.
+
+        With ``auto``, log that the terms are costly, or why they are left out.
+        """
         if not Boundary.move(view, trace):
             return False
         why = Boundary.obstacle(view) if self.boundary == "auto" else ""
@@ -230,7 +237,7 @@ class PathReplayIntegrator(PathIntegrator):
         return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._flow_obstacle(view))
 
     def _flow_obstacle(self, view: Pass) -> str:
-        """Return why the pass needs a film flow, which a pixel sweep does not support; "" if it needs none."""
+        """Return why the pass needs a film flow, which `pixel_sweep` does not support; "" if it needs none."""
         if self.boundary in ("none", "primary"):
             return ""
         with self._pass_context():
@@ -250,9 +257,11 @@ class PathReplayIntegrator(PathIntegrator):
     ) -> mi.TensorXf:
         """Render an image and back-propagate a loss with derivative offset + slope · image, in one pass.
 
-        The interior term evaluates the loss derivative of a path from the other sample sets of its pixel (see
-        `pixel_sweep`). The boundary term evaluates the loss derivative from the image. The documentation of `sweep`
-        states what is not differentiated. Warns like `render_backward`. Requires `supports_pixel_sweep`.
+        The paths of a pixel form independent sets (see `pixel_sweep`). The interior term evaluates the loss derivative
+        of a path from the paths of all other sets. The boundary term evaluates the loss derivative from the image. The
+        documentation of `sweep` states what is not differentiated.
+
+        Warns like `render_backward`. Requires `supports_pixel_sweep`.
 
         Args:
             scene: the scene, without media.
@@ -332,7 +341,7 @@ class PathReplayIntegrator(PathIntegrator):
         return self.baseline[1]
 
     def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:
-        """Log doubts about the gradient. Return the control variate, or None if the pass has none or may not use it.
+        """Log messages about wrong or incomplete gradients. Return the control variate, or None if none may be used.
 
         A pass never uses a control variate to which it has contributed, because the gradient would be biased.
         """

@@ -36,21 +36,23 @@ def image(view: Pass, trace: TraceConfig) -> mi.TensorXf:
 def tangent(view: Pass, trace: TraceConfig, driver: ForwardDriver) -> TermResult:
     """Compute the tangent of the image with a driver.
 
-    If paths move with the parameters, also count the paths with an incomplete gradient.
+    If hit points, directions or emitter samples depend on parameters with gradients, also count the paths with an
+    incomplete gradient.
     """
     rays, lost = view.rays(), NonFiniteCounter()
     δL, valid, moves = driver(trace, rays.start, lost)
     image = splat(view, rays, δL, valid)
     if not moves:
         return TermResult(image)
-    dr.eval(image)  # the kernel of the image also counts the lost paths
+    dr.eval(image)  # the kernel of the image also counts the paths with an incomplete gradient
     return TermResult(image, lost=lost.count, paths=dr.width(rays.ray), moves=True)
 
 
 def back_propagate(view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, driver: Driver) -> TermResult:
     """Back-propagate the adjoint of the image with a driver.
 
-    If paths move or the scene has media, also count the paths with an incomplete gradient.
+    If hit points, directions or emitter samples depend on parameters with gradients, or if the scene has media, also
+    count the paths with an incomplete gradient.
     """
     rays, lost = view.rays(), NonFiniteCounter()
     δL, paths = adjoint(view, rays, grad_in), dr.width(rays.ray)
@@ -68,9 +70,9 @@ class PathReplay:
     weights that are exactly zero.
     """
 
-    adjoint: str  # recorded (`sweep`) or replay
-    auto: bool  # use `replay` for paths too deep for a record, and `emission_only` if only emitters have gradients
-    branch: str | bool  # whether each path branches at one null collision (auto: if the media require it)
+    adjoint: str  # "recorded" for `sweep`, or "replay" for `replay`
+    auto: bool  # use `replay` for paths too deep to be recorded, and `emission_only` if only emitters have gradients
+    branch: str | bool  # whether paths branch at a null collision; "auto": if the media require branching
     recovery: Recovery  # regularisation of `replay`
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
@@ -102,7 +104,7 @@ class PathReplay:
         return TermResult(image, lost=lost.count, paths=lanes * view.spp, moves=True) if moves else TermResult(image)
 
     def _or_emission_only(self, driver: Driver) -> Driver:
-        """Return the driver; with ``auto``, one that uses `emission_only` if only emitters have gradients."""
+        """Return the driver. With ``auto``, it runs `emission_only` if only emitters have gradients."""
         return lights_or(driver) if self.auto else driver
 
     def note(self, trace: TraceConfig) -> str:
@@ -120,7 +122,10 @@ class PathReplay:
         return self.adjoint == "recorded" and not (self.auto and trace.max_depth > deepest(trace))
 
     def _with_baseline(self, trace: TraceConfig, learned: Baseline | None) -> TraceConfig:
-        """Add the baseline and the branching weight of earlier passes to ``trace``, if there are media."""
+        """Return ``trace`` with the learned control variate and the weight of null collisions, if the scene has media.
+
+        Both are learned from earlier passes. Without null branching, the weight of null collisions is None.
+        """
         if trace.media is None:
             return trace
         branching = None

@@ -104,7 +104,7 @@ def exclusive() -> Iterator[None]:
 
 @contextmanager
 def careful() -> Iterator[None]:
-    """Context of a pass, in which the rules above hold and errors are unwrapped (see `plain_errors`).
+    """Context of a pass, in which the rules of this module hold and errors are unwrapped (see `plain_errors`).
 
     Raises PathreplayError if another thread is in a pass or in an `exclusive` block.
     """
@@ -158,7 +158,7 @@ def plain_errors() -> Iterator[None]:
 
 
 def _hide_garbage() -> None:
-    """Hide all objects from the collector in constant time, unless other code has done so. See `_on_collection`."""
+    """Hide all objects from the collector in constant time, unless other code has hidden any. See `_on_collection`."""
     global _hidden
     if _hidden or gc.get_freeze_count() == 0:
         gc.freeze()

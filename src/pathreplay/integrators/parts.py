@@ -32,7 +32,8 @@ A_PART = 2**22
 # Largest number of samples per pixel in one pass or part. At this number, a pixel of constant colour has a relative
 # rounding error of 7e-4.
 MOST_A_PIXEL = 2**16
-# Smallest number of samples per pixel in a part with many pixels: with fewer, the work on the film would be noticeable.
+# Smallest number of samples per pixel in a part with many pixels. Every part repeats the work on the film. With fewer
+# samples per part, this work would take a noticeable fraction of the time.
 LEAST_A_PIXEL = 4
 # Largest number of samples of one call. A call of this size takes minutes on current machines. Calls show no progress
 # and cannot be interrupted.
@@ -102,7 +103,7 @@ def summed(scene: mi.Scene, passes: Sequence[Pass]) -> Iterator[Callable[[], Non
     try:
         yield (lambda: None) if sums is None else sums.take
     finally:
-        if sums is not None:  # also after an error, because the sums include the gradients of earlier passes
+        if sums is not None:  # even after an error, because the sums include the gradients of earlier passes
             sums.give()
 
 

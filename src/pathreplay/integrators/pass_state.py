@@ -32,7 +32,7 @@ class PassState:
 
     @property
     def is_complete(self) -> bool:
-        """Whether `begin` ran outside of a recording, where it can inspect the scene."""
+        """Whether `begin` could inspect the scene. While `dr.freeze` records, `begin` cannot inspect the scene."""
         return self.branches is not None
 
     def after(self, result: TermResult) -> PassState:

@@ -50,7 +50,7 @@ def reached(scene: mi.Scene, sensor: Which, zero_is_error: bool = False) -> Iter
     """Context of a gradient pass: explain `Unreached` errors, and suppress them if the gradient is zero by design.
 
     The gradient is zero by design if only other cameras have gradients (see `unreached_note`). With ``zero_is_error``,
-    the error is raised in this case, too.
+    the error is also raised if the gradient is zero by design.
     """
     try:
         yield
@@ -87,14 +87,15 @@ class PathIntegrator:
                 f"{self.name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
                 f"use {mi.variant().replace('_polarized', '')!r}"
             )
-        # Mitsuba reads these three properties as well, but validates less.
+        # Mitsuba reads these three properties as well, but does not reject all invalid values.
         whole_number(props, self.name, MAX_DEPTH, lowest=0, unbounded=True)
         whole_number(props, self.name, RR_DEPTH, lowest=1)
         hide_emitters = flag(props, self.name, HIDE_EMITTERS)
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
         self.warned: set[str] = set()  # notes that were logged or silenced
-        self.tables: Tables | None = None  # tables of the last rendered scene, for recordings by a user's `dr.freeze`
+        # Lookup tables of the last rendered scene, for functions of the user that `dr.freeze` records.
+        self.tables: Tables | None = None
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -174,12 +175,13 @@ class PathIntegrator:
         passes = parts(view)
         with reached(view.scene, view.sensor), summed(view.scene, passes) as add_up:
             for part in passes:
-                # Isolated, so that the AD graph from the parameters to derived scene values survives for the next pass.
+                # Isolation preserves the AD graph from the parameters to derived scene values for the next pass.
                 with self._pass_context(), dr.isolate_grad():
                     part, trace, terms = self._planned(part, state)
                     learned = self._learned(part, trace, state)
                     weighted = grad_in if part.share == 1 else grad_in * part.share
-                    with dr.isolate_grad():  # postpones traversal of the film flow, which all terms share, to the end
+                    # All terms share the film flow. Isolation postpones back-propagation through the flow to the end.
+                    with dr.isolate_grad():
                         result = self._backward(terms, part, trace, weighted, learned)
                 self._log_notes(part, trace, result)
                 state = state.after(result)
@@ -207,7 +209,8 @@ class PathIntegrator:
     def begin(self, scene: mi.Scene) -> PassState:
         """Create the state of a pass over a scene.
 
-        In a recording by a user's `dr.freeze`, the state contains only tables, because media cannot be inspected.
+        While `dr.freeze` records a function of the user, media cannot be inspected. The state then only contains the
+        lookup tables of the scene.
         """
         with careful():
             facts = facts_of(scene)
@@ -234,7 +237,7 @@ class PathIntegrator:
         return reduce(add, [term.backward(part, trace, grad_in, learned) for term in terms])
 
     def _planned(self, view: Pass, state: PassState) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
-        """Return the gradient pass with its film flow, its trace configuration, and the terms to add."""
+        """Return the gradient pass with its film flow, its trace configuration, and the terms of the gradient."""
         return view, self._trace_config(view.scene, view.sensor, state), self.terms
 
     def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:

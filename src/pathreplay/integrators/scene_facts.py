@@ -1,4 +1,4 @@
-"""Facts about a scene. Objects are collected once; every pass determines which objects have gradients."""
+"""Facts about a scene. Its objects are collected once. Every pass determines which of the objects have gradients."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class SceneFacts:
         return scene_media(self._media, self._traits.veils, sensor, branches)
 
     def constants(self) -> tuple[object, ...]:
-        """Return the current values of media that are constants in kernels: see `GridMedium.constants`."""
+        """Return the current values that media supply to kernels as constants: see `GridMedium.constants`."""
         return tuple(medium.constants for medium in self._media if hasattr(medium, "constants"))
 
     def branches(self) -> bool:
@@ -76,7 +76,10 @@ class SceneFacts:
         return wants_branch(self._media)
 
     def traits(self, tables: Tables | None = None) -> Traits:
-        """Return the current traits, with the given ``tables`` or, by default, the current tables."""
+        """Return the current traits: facts about the scene on which the drivers depend.
+
+        The traits contain ``tables`` or, by default, the current lookup tables.
+        """
         return replace(
             self._traits,
             tables=self.tables() if tables is None else tables,
@@ -87,7 +90,7 @@ class SceneFacts:
         )
 
     def tables(self) -> Tables:
-        """Return the current tables; only changed parts are rebuilt."""
+        """Return the current lookup tables of BSDFs, shapes and emitters. Only changed tables are rebuilt."""
         boxes, sizes = [shape.bbox() for shape in self._shapes], _sizes(self._shapes)
         if self._tables is None:
             self._tables = tables_of(self._traits.attachables, self._shapes, self._lights)
@@ -104,10 +107,10 @@ class SceneFacts:
         return self._tables
 
     def recorded_tables(self, known: Tables | None, edges: bool) -> Tables:
-        """Return the tables of a pass that `dr.freeze` records.
+        """Return the lookup tables for a pass that `dr.freeze` records.
 
-        Returns the ``known`` tables if they belong to this scene. Otherwise the recording computes the current tables,
-        which include smoothing groups only if the pass searches for ``edges``.
+        Returns the ``known`` tables if they belong to this scene. Otherwise the recording computes new tables. The
+        new tables include smoothing groups only if ``edges`` is set, that is, if the pass searches for edges.
         """
         if known is not None and known is self._tables:
             return known

@@ -62,7 +62,7 @@ class StatefulIntegrator(Protocol):
 
     @property
     def baseline(self) -> object:
-        """Learned state, replaced by a new object at each change; None if there is none."""
+        """Learned state, or None. At each change, a new object replaces the state."""
 
     def state_dict(self) -> dict[str, np.ndarray]: ...
 
@@ -148,7 +148,7 @@ class Stateless:
 
 
 def stateful(integrator: mi.Integrator) -> StatefulIntegrator:
-    """Return the integrator itself if it implements the interface, otherwise wrapped in an adapter."""
+    """Return the integrator itself if it implements the interface. Otherwise return an adapter for it."""
     return integrator if isinstance(integrator, StatefulIntegrator) else Stateless(integrator)
 
 

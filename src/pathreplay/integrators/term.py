@@ -1,4 +1,4 @@
-"""Terms of a gradient: functions of a pass, and their results."""
+"""Terms of a gradient: the interface of a term, and its result."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TermResult:
     stats: BaselineStats | None = None  # radiance in media, from which the control variate of later passes is computed
     lost: mi.UInt32 | None = None  # number of paths with an incomplete gradient; None if not counted
     paths: int = 0  # number of paths among which ``lost`` were counted
-    moves: bool = False  # hit points, directions or emitter samples depend on parameters with gradients
+    moves: bool = False  # whether hit points, directions or emitter samples depend on parameters with gradients
 
     def __add__(self, other: TermResult) -> TermResult:
         image, stats, lost = (_sum(getattr(self, name), getattr(other, name)) for name in ("image", "stats", "lost"))

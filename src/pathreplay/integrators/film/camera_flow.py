@@ -54,11 +54,11 @@ class Sample:
     aperture: mi.Point2f
 
     def ray(self, sensor: mi.Sensor) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """Return the sensor's ray, attached to the sensor and the film position, and its weight."""
+        """Return the sensor's ray and its weight. The ray is attached to the sensor and to the film position."""
         return sensor.sample_ray_differential(self.time, self.wavelength, self.position, self.aperture)
 
     def at(self, position: mi.Point2f) -> Sample:
-        """Return the same sample at another film position."""
+        """Return a copy of the sample at another film position."""
         return Sample(self.time, self.wavelength, position, self.aperture)
 
 
@@ -71,13 +71,13 @@ class FilmFlow(Protocol):
 
     @property
     def samples(self) -> int:
-        """Number of samples per pixel for which `FilmMotion` traces one group of paths."""
+        """Number n of samples: `FilmMotion` traces one group of paths for every n samples of a pixel."""
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """Return the sensor's ray and its weight.
 
         If the sample's position has gradients, the ray is differentiable in this position. Otherwise the derivative of
-        the ray is the rest of the motion, which the flow does not contain.
+        the ray is ∂c/∂π + ∂c/∂s v, the motion that the flow does not contain (see the module).
         """
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
@@ -93,7 +93,7 @@ class FilmFlow(Protocol):
         """Return whether the ray through a film position may have motion that the flow does not contain."""
 
     def carry_tangents(self) -> None:
-        """Propagate tangents of the parameters to values that the terms of a pass share, once for all terms."""
+        """Propagate tangents from the parameters to the arrays of the flow, once for all terms of a pass."""
 
 
 @dataclass(frozen=True)
@@ -101,14 +101,14 @@ class CameraFlow:
     """The flow of a moving sensor: see `FilmFlow`."""
 
     sensor: mi.Sensor
-    r: mi.Float  # distance of the points through which the rays continue to pass
+    r: mi.Float  # distance along a ray to the point p through which the moving ray still passes
     leaves_rest: bool  # whether rays have motion that the flow does not contain
     is_all: bool
     samples: int = 2
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor) -> CameraFlow | None:
-        """Create the flow of a sensor; None if it has no gradients, or its class is not one of `CAMERAS`."""
+        """Create the flow of a sensor. None if the sensor has no gradients or its class is not one of `CAMERAS`."""
         if sensor.class_name() not in CAMERAS or not with_gradients(sensor, *ONLY_POSITIONS, *OTHERS):
             return None
         rest = _is_carried(sensor) or bool(with_gradients(sensor, *OTHERS[1:]))
@@ -148,7 +148,7 @@ class CameraFlow:
         return mi.Bool(self.leaves_rest)
 
     def carry_tangents(self) -> None:
-        """Do nothing, since all terms differentiate the sensor itself."""
+        """Do nothing: the terms differentiate the sensor itself, so this flow has no arrays with tangents."""
 
     def _velocity(self, ray: mi.Ray3f, derivatives: RayDerivatives) -> mi.Vector2f:
         """Compute the `velocity` from an attached ray and its derivatives along the film's axes."""
@@ -165,7 +165,7 @@ def film_velocity(δp: mi.Vector3f, derivatives: RayDerivatives, t: mi.Float) ->
 
 
 def move_with_position(ray: mi.Ray3f, derivatives: RayDerivatives, v: mi.Vector2f) -> None:
-    """Add the motion of a ray that a velocity v of its film position causes."""
+    """Add to ``ray`` the motion that a ray has if its film position moves with the velocity v."""
     o, d = derivatives
     ray.o += o[0] * v.x + o[1] * v.y
     ray.d += d[0] * v.x + d[1] * v.y
@@ -183,7 +183,7 @@ def probe_position(i: mi.UInt32, n: int) -> mi.Point2f:
 
 
 def ray_derivatives(sensor: mi.Sensor, sample: Sample) -> RayDerivatives:
-    """Return the derivatives of a ray with respect to its film position, by central differences. Detached."""
+    """Return the derivatives of a ray with respect to its film position, by central differences. They are detached."""
     o, d = [], []
     with dr.suspend_grad():
         for step in (mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP)):
@@ -194,9 +194,10 @@ def ray_derivatives(sensor: mi.Sensor, sample: Sample) -> RayDerivatives:
 
 
 def _is_carried(sensor: mi.Sensor) -> bool:
-    """Return whether the camera's pose has gradients that move rays in a way that the flow does not contain.
+    """Return whether gradients of the camera's pose cause motion of rays that the flow may not contain.
 
-    For a pinhole camera, only translation does so. For any other camera, all gradients of the pose count.
+    The flow contains all rotation of a pinhole camera, but no parallax. The result is therefore True for a pinhole
+    camera whose translation has gradients, and for any other camera whose pose has gradients.
     """
     poses = with_gradients(sensor, "to_world")
     if sensor.class_name() != PINHOLE:

@@ -91,11 +91,11 @@ class FilmPlaces:
         return self.developed(self._put(s, dr.select(inside, L, 0), wavelengths))
 
     def importance_of_pixels(self, block_grad: mi.TensorXf, pixel: mi.UInt32, wavelengths: mi.Spectrum) -> mi.Spectrum:
-        """Return g_j / ∫ h_j (see `importance`) for the pixels j with these row-major indices."""
+        """Return g_j / ∫ h_j (see `importance`) for each row-major index j in ``pixel``."""
         return _splat_adjoint(lambda L: self.pixels(pixel, L, wavelengths), dr.width(pixel), block_grad)
 
     def pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
-        """Sum radiance ``L`` by pixel (row-major index), without a filter; return the pixels of the block."""
+        """Return the pixels of a block to which radiance ``L`` is added by row-major index, without a filter."""
         film, filtered = self.view.sensor.film(), self._block()
         offset, size = mi.ScalarPoint2i(film.crop_offset()), mi.ScalarVector2u(film.crop_size())
         block = mi.ImageBlock(size, offset, filtered.channel_count())
@@ -142,7 +142,7 @@ class FilmPlaces:
 
 
 def _splat_adjoint(splat: Callable[[mi.Spectrum], mi.TensorXf], lanes: int, block_grad: mi.TensorXf) -> mi.Spectrum:
-    """Back-propagate the adjoint of pixels through a linear function ``splat`` of radiance."""
+    """Back-propagate ``block_grad``, the adjoint of pixels, through ``splat``, a linear function of radiance."""
     with dr.resume_grad():
         L = dr.full(mi.Spectrum, 1.0, lanes)
         dr.enable_grad(L)

@@ -2,8 +2,9 @@
 
 If positions are drawn from the density w / ∫ w of a filter w, the mean radiance of paths is the filtered pixel
 (Ernst, Stamminger and Greiner, "Filter Importance Sampling", 2006). Pixels share no samples, so images are noisier than
-with splatting. A filter is the product of a function of x and one of y, tabulated as `STEPS` constant steps. If the
-function has negative parts, its absolute value is sampled, and `sign` returns the sign.
+with splatting. A filter is the product of a function of x and a function of y. `FilterSamples` tabulates one of these
+functions, or its derivative, as `STEPS` constant steps. If the tabulated function has negative parts, its absolute
+value is sampled, and `sign` returns the sign.
 """
 
 from __future__ import annotations
@@ -73,16 +74,16 @@ class FilterSamples:
         return (mi.Float(i) + across) * (2 * self.radius / STEPS) - self.radius
 
     def _step(self, i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-        """Return the cumulative distribution at the begin and the end of step i."""
+        """Return the cumulative distribution at the beginning and the end of step i."""
         begin = dr.select(i > 0, dr.gather(mi.Float, self.cdf, i - 1, i > 0), 0)
         return begin, dr.gather(mi.Float, self.cdf, i)
 
     def mass(self, x: mi.Float) -> mi.Float:
-        """Return the integral of the function over the step that contains an offset; zero outside the support."""
+        """Return the integral of the tabulated function over the step at an offset. Zero outside the support."""
         return dr.select(dr.abs(x) <= self.radius, dr.gather(mi.Float, self.masses, self._locate(x)[1]), 0)
 
     def sign(self, x: mi.Float) -> mi.Float:
-        """Return the sign of the function at an offset."""
+        """Return the sign of the tabulated function at an offset."""
         return dr.sign(dr.gather(mi.Float, self.masses, self._locate(x)[1]))
 
     def _locate(self, x: mi.Float) -> tuple[mi.Float, mi.UInt32]:

@@ -14,8 +14,8 @@ from pathreplay.platform.registration import mitsuba_integrator
 
 # Dr.Jit counts the samples of one kernel in 32 bits.
 MOST_SAMPLES = 2**32 - 1
-# Bytes per pixel. An image, its derivative and their files take 127 bytes per pixel. This is the peak memory of the
-# process, measured for 2048 x 2048 pixels on LLVM. The memory of samples is negligible.
+# Bytes per pixel. An image, its derivative and their files take 127 bytes per pixel, measured as the peak memory of the
+# process for 2048 x 2048 pixels on LLVM. The memory of samples is negligible.
 _A_PIXEL = 128
 
 
@@ -26,7 +26,7 @@ def splat(view: Pass, rays: Rays, L: mi.Spectrum, valid: mi.Bool) -> mi.TensorXf
     """
     film = view.sensor.film()
     block = film.create_block()
-    # Summing the samples of a pixel before the write pays off only for several samples.
+    # Summing the samples of a pixel before they are written pays off only for several samples per pixel.
     block.set_coalesce(block.coalesce() and rays.spp >= 4)
     mitsuba_integrator()._splat_to_block(
         block,
@@ -45,7 +45,7 @@ def splat(view: Pass, rays: Rays, L: mi.Spectrum, valid: mi.Bool) -> mi.TensorXf
 def adjoint(view: Pass, rays: Rays, grad_in: mi.TensorXf) -> mi.Spectrum:
     """Return δL of each ray: the adjoint ``grad_in`` of the image, propagated back through filter and normalisation."""
     with dr.resume_grad():
-        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.position))  # one entry per ray, even if all rays are equal
+        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.position))  # one entry, and so one adjoint, per ray
         dr.enable_grad(L)
         image = splat(view, rays, L, mi.Bool(True))
         dr.set_grad(image, grad_in)
@@ -72,7 +72,9 @@ def film_size(sensor: mi.Sensor) -> tuple[int, int]:
 def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int = 0) -> None:
     """Check that Dr.Jit can process all samples of a sensor in one kernel, and that memory suffices for its images.
 
-    ``spp`` maps configuration keys to their samples per pixel; ``also`` is the number of further bytes that are needed.
+    ``spp`` maps configuration keys to their samples per pixel. ``also`` is the number of bytes that are needed in
+    addition to the images.
+
     Raises PathreplayError if one of the checks fails. The message calls the sensor ``name`` and states the remedy.
     """
     width, height = film_size(sensor)

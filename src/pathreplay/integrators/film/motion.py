@@ -21,8 +21,8 @@ sampled for the pixel at x_j therefore contributes to all pixels of the row, wit
 
     (W_j - W̄_j) sgn df(x - x_j) + Σ_i W̄_i df(x - x_i) / Σ_i |df(x - x_i)|,
 
-where the denominator is the density of the positions that are sampled for all pixels of the row. Forward mode is the
-transpose.
+where the denominator is the density of the positions that are sampled for all pixels of the row. Forward mode applies
+the transpose of this map from W to weights.
 """
 
 from __future__ import annotations
@@ -58,21 +58,21 @@ falls with the third power of this length, if the adjoint is smooth over the squ
 
 @dataclass
 class FlowPaths:
-    """The paths that the term traces: their pixels, their film positions and their weighted radiance."""
+    """The paths that `FilmMotion` traces: their pixels, their film positions and their weighted radiance."""
 
     pixel: mi.UInt32  # row-major index
     sample: Sample  # sample of the camera ray
     axis: mi.UInt32  # axis along which the two positions of a pair differ
     single: mi.Bool  # whether the path estimates the divergence and belongs to no pair
     offset: mi.Float  # distance of a path of a pair from the pixel centre, along the axis
-    derivative: FilterSamples  # sampler of the offsets: the derivative of the filter
+    derivative: FilterSamples  # sampler that draws the offsets from the derivative of the filter
     L: mi.Spectrum  # weighted radiance, to be multiplied by the velocity or the divergence
     wavelengths: mi.Spectrum
 
 
 @dataclass(frozen=True)
 class FilmMotion:
-    """The gradient term of a film flow. Not differentiated: motion of rays that the flow does not contain."""
+    """The gradient term of a film flow. It does not differentiate motion of rays that the flow does not contain."""
 
     flow: FilmFlow
 
@@ -97,7 +97,7 @@ class FilmMotion:
             for i, factor in self._smooth_factors(view, f)
         )
         δ = dr.sum(W * f.L)
-        # Each camera parameter's gradient is a separate sum; without this evaluation, each sum would trace all paths.
+        # The gradient of each camera parameter is a separate sum. Without evaluation, each sum would trace all paths.
         dr.eval(δ, f.sample.position)
         with dr.resume_grad():
             backward(δ * self._flow_factor(view, f))
@@ -109,15 +109,20 @@ class FilmMotion:
         return ""
 
     def _flow_factor(self, view: Pass, f: FlowPaths) -> mi.Float:
-        """Return one factor per path: for pairs, the velocity along the pair's axis, in pixels; else the divergence."""
+        """Return the factor by which the radiance of each path is multiplied.
+
+        For a path of a pair, the factor is the velocity along the axis of the pair, in pixels. For a path that belongs
+        to no pair, the factor is the divergence of the flow.
+        """
         v = self.flow.velocity(f.sample) * mi.Vector2f(*view.size)
         return dr.select(f.single, self.flow.divergence(f.sample), dr.select(f.axis == 0, v.x, v.y))
 
     def _smooth_factors(self, view: Pass, f: FlowPaths) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Return (pixel, factor) of each pixel to which a path contributes through the local mean W̄ of the adjoint.
+        """Return (pixel, factor) for each pixel to which a path contributes through the local mean W̄ of the adjoint.
 
-        For a path of a pair, the sum of factor · W̄ is added to the adjoint W of the path's own pixel. The first entry
-        subtracts W̄ of the own pixel, which W contains. For a path that is not part of a pair, all factors are zero.
+        `backward` multiplies the radiance of a path by a weight: the adjoint W of the path's own pixel, plus the sum of
+        factor · W̄ over the returned pixels. The first entry subtracts W̄ of the path's own pixel from W. For a path that
+        belongs to no pair, all factors are zero.
         """
         width, height = view.size
         derivative, along_x = f.derivative, f.axis == 0
@@ -137,8 +142,8 @@ class FilmMotion:
     def _mean_radiance(self, view: Pass, trace: TraceConfig) -> mi.Float:
         """Estimate the mean radiance over the positions at which the flow may be non-zero, from independent paths.
 
-        Subtracting this mean from all radiance reduces noise. It adds no bias, because motion does not change a
-        constant image.
+        Subtracting this mean from all radiance reduces noise. The subtraction adds no bias, because motion does not
+        change a constant image.
         """
         width, height = view.size
         pixel = dr.arange(mi.UInt32, width * height)

@@ -1,4 +1,7 @@
-"""The adapter to `pixel_sweep`: checks of the sensor, and camera rays and loss derivative of each pixel."""
+"""Inputs of `pixel_sweep`, which computes an image and the gradient of a loss from the same paths.
+
+The inputs are the camera rays and the loss derivative of each pixel. `obstacle` checks whether a sensor is supported.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +21,20 @@ from pathreplay.platform.device import device_of
 
 
 def _largest_spp(max_depth: int) -> int:
-    """Return the largest number of paths whose vertices fit into the record of a lane."""
+    """Return the largest number of paths of a pixel whose vertices fit into the local memory of one lane."""
     device = device_of(mi.variant())
     return device.most_records(LARGEST_RECORD, MAX_DEPTH) // device.room(max(max_depth, 1))
 
 
 def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) -> str:
-    """Return why a sensor does not support pixel sweeps, with the remedy; "" if it does.
+    """Return why `pixel_sweep` does not support a sensor, with the remedy; "" if it does.
 
-    The text is the end of a sentence. A sweep requires an rgb image without alpha, an independent sampler, and a camera
-    without motion and with an instantaneous shutter. The filter must be a box, so that each path belongs to one pixel.
-    If only ``some`` pixels are swept, any non-negative filter can be used (see `FilterSamples`). A pixel must have at
-    least two paths (``spp``), which together fit into the record of a lane.
+    `pixel_sweep` requires an rgb image without alpha, an independent sampler, and a camera without motion and with an
+    instantaneous shutter. The filter must be a box, so that each path belongs to one pixel. If only ``some`` pixels are
+    rendered, any non-negative filter can be used (see `FilterSamples`). The number ``spp`` of paths of a pixel must be
+    at least two, and the vertices of these paths must together fit into the local memory of one lane.
+
+    The returned text can follow the word "since" in a message.
     """
     film, sampler = sensor.film(), sensor.sampler()
     film.prepare([])
@@ -61,10 +66,10 @@ def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) ->
 
 
 def pixel_camera(sensor: mi.Sensor, pixel: mi.UInt32) -> Callable[..., tuple[mi.Ray3f, mi.Spectrum]]:
-    """Return a function that samples rays through pixels (UInt32, row-major): (sampler, active) -> Ray3f and Spectrum.
+    """Return a function that samples one ray through each of the pixels with the row-major indices ``pixel``.
 
-    The Spectrum is the weight of the ray. Rays are sampled as in Mitsuba's RBIntegrator, except that the film's filter
-    is importance sampled. The results are detached.
+    The function maps (sampler, active) to the rays (Ray3f) and their weights (Spectrum). Rays are sampled as in
+    Mitsuba's RBIntegrator, except that the film's filter is importance sampled. The results are detached.
     """
     width, height = sensor.film().crop_size()
     sample_position = _position_sampler(sensor.film(), mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)))
@@ -97,8 +102,8 @@ def pixel_loss(
 ) -> PixelLoss:
     """Gather the loss derivative for the pixel of each lane.
 
-    There is one lane for each pixel of the film or, if given, for each entry of ``pixels``. With ``pixels``, the
-    tensors have one row per entry.
+    There is one lane for each pixel of the film or, if ``pixels`` is given, one lane for each entry of ``pixels``. In
+    the second case, ``offset`` and ``slope`` have one row per entry.
 
     Raises PathreplayError for an unsuitable number of samples, a wrong shape, or repeated or invalid pixels.
     """

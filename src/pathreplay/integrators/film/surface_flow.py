@@ -1,4 +1,4 @@
-"""Flow of a static camera: film positions follow the visible surfaces, so that surfaces move little relative to them.
+"""Flow of a static camera: film positions follow the visible surfaces, which then move little relative to them.
 
 A few probe rays sample the scene. A point p that a probe ray hits moves with its surface. The image of p
 moves on the film with the velocity
@@ -13,9 +13,10 @@ velocity at a node of a grid is the mean
     v = Σ K W u / (K_0 + Σ K (W + S)),     W = 1 / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
 
 over nearby points, where r is their distance from the node on the film. Static points contribute with u = 0. Between
-nodes, v is interpolated. In a narrow field of view, u is large, and film positions that follow u cause more noise than
-fixed film positions. The term S then reduces v. Every v gives the same derivative of the image (see `camera_flow`).
-With this v, little motion is left for the interior and boundary terms.
+nodes, v is interpolated. The constant K_0 is the weight of v = 0. In a narrow field of view, u is large, and film
+positions that follow u cause more noise than fixed film positions. S is inversely proportional to the square of the
+field of view, and reduces v in this case. Every v gives the same derivative of the image (see `camera_flow`). With this
+v, little motion is left for the interior and boundary terms.
 """
 
 from __future__ import annotations
@@ -126,12 +127,12 @@ class SurfaceFlow:
         return self.moves_at(position)
 
     def carry_tangents(self) -> None:
-        """Propagate tangents to the nodes."""
+        """Propagate tangents from the parameters to the velocities at the nodes."""
         with dr.resume_grad():
             tangents(self.nodes)
 
     def _corners(self, position: mi.Point2f) -> tuple[list[mi.Vector2f], mi.Point2f]:
-        """Return the velocities at the corners of a position's cell, row by row, and its coordinates in the cell."""
+        """Return the velocities at the corners of the cell that contains a position, and the position in the cell."""
         cell, f = _cell_at(position)
         return [dr.gather(mi.Vector2f, self.nodes, _node(cell, x, y)) for y in (0, 1) for x in (0, 1)], f
 
@@ -166,6 +167,6 @@ def _cell_of(node: mi.UInt32) -> mi.Point2i:
 
 
 def _node(cell: mi.Point2i, x: int, y: int) -> mi.UInt32:
-    """Return the row-major index of the node x columns and y rows after a cell's first node, clamped to the grid."""
+    """Return the row-major index of the node at (x, y) relative to the first node of a cell, clamped to the grid."""
     at = dr.clip(cell + mi.Point2i(x + MARGIN, y + MARGIN), 0, NODES - 1)
     return mi.UInt32(at.x + at.y * NODES)

@@ -1,1 +1,1 @@
-"""Integrators of light paths: their term, and the plugin that traces all light from the emitters."""
+"""Light paths from the emitters: the gradient term, and the integrator plugin that traces all light this way."""

@@ -44,8 +44,10 @@ class ParticleIntegrator(PathReplayIntegrator):
     Sensors: ``perspective``, ``thinlens``, ``orthographic`` and ``irradiancemeter``. The image is the same as with
     ``sample_border = true`` in the film (see `ParticleFilm`).
 
-    Not differentiated: the visibility of vertices from each other and from the sensor; with ``attach='none'``, all
-    motion; with a box filter, the motion of film positions.
+    The integrator does not differentiate the visibility of vertices from each other and from the sensor. With
+    ``attach='none'``, it does not differentiate any motion. With a box filter, it does not differentiate the motion of
+    film positions.
+
     Raises PathreplayError for unknown or unusable properties, for scenes with media, and in polarised variants.
     """
 
@@ -72,7 +74,7 @@ class ParticleIntegrator(PathReplayIntegrator):
         return PathReplayIntegrator._planned(self, view, state, follow)
 
     def _camera_view(self, view: Pass) -> Pass:
-        """Return the pass of the camera rays."""
+        """Return the pass whose rays start camera paths. The number of these rays is limited."""
         return _few_rays(view)
 
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:

@@ -25,8 +25,9 @@ from pathreplay.transport.vertex import TraceConfig
 class ParticleTerm:
     """Image and derivative of light paths. A pass traces as many light paths as it has samples.
 
-    Every path is differentiated as in `PathReplay`, and also with respect to its film positions. Not differentiated:
-    the visibility of vertices from each other and from the sensor, and with a box filter the motion of film positions.
+    Every path is differentiated as in `PathReplay`, and also with respect to its film positions. The visibility of
+    vertices from each other and from the sensor is not differentiated. With a box filter, the motion of film positions
+    is not differentiated either.
     """
 
     max_depth: int  # depth of the whole path from emitter to sensor, counted as in Mitsuba
