@@ -40,11 +40,12 @@ _ROUNDS = 5
 def caustic_heights(
     image: ArrayLike, optics: Optics, shape: tuple[int, int] | None = None, floor: float = 0.02
 ) -> NDArray[np.float32]:
-    """Compute heights of the exit surface of a slab, or of a mirror, whose caustic approximates an image.
+    """Compute the heights of a surface whose caustic approximates an image.
 
-    Row 0 and column 0 of the heights are at the smallest y and x of the surface, and row 0 and column 0 of the
-    image at the smallest y and x of the receiver. The image is therefore upright for a camera that looks at the
-    receiver from the side of the surface, with x to the right and y down.
+    The surface is a mirror or the exit surface of a slab of glass. Row 0 and column 0 of the heights are at the
+    smallest y and x of the surface, and row 0 and column 0 of the image at the smallest y and x of the receiver. The
+    image is therefore upright for a camera that looks at the receiver from the side of the surface, with x to the right
+    and y down.
 
     Args:
         image: irradiance (rows, columns), nonnegative; its scale is arbitrary.
@@ -87,7 +88,7 @@ def caustic_heights(
 
 
 def _density(image: ArrayLike, shape: tuple[int, int] | None, floor: float) -> Field:
-    """Resample the image to ``shape``, and return (1 - floor) times the image with mean 1, plus ``floor``."""
+    """Resample an image to ``shape``, scale it to mean 1, and return (1 - ``floor``) · image + ``floor``."""
     density = np.asarray(image, np.float64)
     if density.ndim == 3 and density.shape[2] == 1:
         density = density[..., 0]
@@ -123,8 +124,8 @@ def _sources(φ: Field, aspect: float, margin: int = 0) -> tuple[Field, Field]:
     """Return the point S(y) of the surface from which light arrives at y, for each cell y of the receiver.
 
     S is the gradient of the potential v = |y|²/2 + φ(y) for cells of width ``aspect`` and height 1 (see
-    `monge_ampere`), scaled to the extent of the surface. The results are its rows and its columns, in units of cells. A
-    ``margin`` adds cells beyond the border, for which the potential is mirrored.
+    `monge_ampere`), scaled to the extent of the surface. The results are the row and the column of S(y), in units of
+    cells. A ``margin`` adds cells beyond the border, where the potential is continued by reflection at the border.
     """
     p = np.pad(φ, margin + 1, mode="symmetric")
     rows, columns = (np.arange(-margin, n + margin) for n in φ.shape)
@@ -134,11 +135,12 @@ def _sources(φ: Field, aspect: float, margin: int = 0) -> tuple[Field, Field]:
 
 
 def _receivers(φ: Field, aspect: float) -> tuple[Field, Field]:
-    """Return the point T(x) of the receiver for each cell x of the surface, in cells. T is the inverse of `_sources`.
+    """Return the point T(x) of the receiver for each cell x of the surface, in units of cells. T is the inverse of S.
 
-    S maps each square of four neighbouring cell centres of the receiver to a quadrilateral. The quadrilaterals cover
-    the surface. T is linear in each of the two triangles of a quadrilateral. (A Delaunay triangulation of the corners
-    takes minutes where S is close to the identity, because the corners of squares lie on circles.)
+    S (see `_sources`) maps each square of four neighbouring cell centres of the receiver to a quadrilateral. The
+    quadrilaterals cover the surface. T is linear in each of the two triangles of a quadrilateral. (A Delaunay
+    triangulation of the corners takes minutes where S is close to the identity, because the corners of squares lie on
+    circles.)
     """
     shape = np.array(φ.shape)
     points = np.stack(_sources(φ, aspect, 1), -1)
@@ -183,7 +185,7 @@ def _at(field: Field, rows: Field, columns: Field) -> Field:
 def _divergence(slope_x: Field, slope_y: Field) -> Field:
     """Return the divergence of slopes at the cells, with zero flux through the border.
 
-    This is the right-hand side of the normal equations of step 3.
+    The result is the right-hand side of the Poisson equation in step 3 (see the module).
     """
     result = np.zeros_like(slope_x)
     for axis, slope in enumerate((slope_y, slope_x)):

@@ -58,7 +58,7 @@ def potential(density: Field, initial: Field | None = None, width: float = 1.0) 
         a, b, c = hessian(φ, width)
         a, b = 1 + a, 1 + b
         determinant = a * b - c * c
-        # The integral of the discretised determinant is not exactly constant, so g is scaled to it.
+        # The mean of the discretised determinant varies slightly with φ, so g is scaled to this mean.
         wanted = g * determinant.mean()
         if np.sqrt(np.mean(np.square(wanted - determinant))) < _ACCURACY:
             return φ
@@ -112,7 +112,10 @@ def _centred(field: Field) -> Field:
 
 
 def _longest(φ: Field, step: Field, least: Field, width: float) -> float:
-    """Shorten a step until v is convex and det D²v is at least ``least``. Return the factor, or 0 if none suffices."""
+    """Return the factor by which a step must be shortened so that v is convex and det D²v is at least ``least``.
+
+    Returns 0 if no tested factor suffices.
+    """
     factor = 1.0
     while factor > _SHORTEST:
         a, b, c = hessian(φ + factor * step, width)

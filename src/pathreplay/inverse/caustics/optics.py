@@ -120,7 +120,7 @@ class Optics:
         """Return direction and flux of light from a point at the distance ``s`` from the entry surface of the slab."""
         depth, r = self.thickness + z, np.hypot(x, y)
         # Newton's method for q = sin θ', where θ' is the angle to the axis in the slab and θ the angle outside:
-        # r = s tan θ + depth tan θ', sin θ = eta q. Both tangents are convex in q, so it converges from above.
+        # r = s tan θ + depth tan θ', sin θ = eta q. Both tangents are convex in q, so q decreases to the solution.
         q = r / np.hypot(r, s) / eta
         for _ in range(20):
             outside, inside = np.sqrt(1 - np.square(eta * q)), np.sqrt(1 - np.square(q))

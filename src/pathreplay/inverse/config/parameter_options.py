@@ -190,7 +190,7 @@ class Parameter(Table):
                 "steps; remove one"
             )
         sizes, begins = self.resolutions or [], self.refine_at or []
-        # If refine_at is missing, `Config.completed_entry` may derive the iterations from the stages of the job.
+        # If refine_at is missing, `Config.completed_entry` may derive it from the stages of the job.
         if self.refine_at is not None and len(begins) != max(0, len(sizes) - 1):
             self._refuse_count()
         if sorted(set(begins)) != begins:

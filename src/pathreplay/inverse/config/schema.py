@@ -150,11 +150,11 @@ class Config(Table):
 
     @property
     def parts(self) -> int:
-        """Number of shards per view and iteration: `spp_shards`, or twice as many if the noise is measured."""
+        """Number of shards per view and iteration: `spp_shards`, or twice `spp_shards` if the noise is measured."""
         return self.spp_shards * (2 if self.halves_samples else 1)
 
     def completed_entry(self, entry: Parameter) -> Parameter:
-        """Return the table of a parameter, with missing values of learning rate and refinement iterations filled in."""
+        """Return a copy of a parameter's table that has values of ``learning_rate`` and ``refine_at``."""
         refine_at = entry.refine_at or []
         if entry.refine_at is None and entry.resolutions is not None and self.stages is not None:
             refine_at = begins(self.stages)[1 : len(entry.resolutions)]

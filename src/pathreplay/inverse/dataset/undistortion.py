@@ -84,7 +84,7 @@ class Lens:
             return above / (1 + r2 * (k[3] + r2 * (k[4] + r2 * k[5])))
 
     def undone(self, image: Image) -> tuple[Image, Image]:
-        """Resample an image to a pinhole camera with the same fx, principal point and size.
+        """Resample an image to a pinhole camera with the fx, the principal point and the size of this lens.
 
         The interpolation is bilinear, in linear radiance.
 
@@ -104,9 +104,9 @@ class Lens:
 
         Args:
             image: the distorted image, shape (height, width, channels).
-            x: slopes of the directions, an array of shape (rows, columns).
-            y: the same vertically.
-            extent: width and height in pixels of ``image`` that correspond to ``w`` and ``h``.
+            x: horizontal components of the directions, an array of shape (rows, columns).
+            y: vertical components of the directions, an array of shape (rows, columns).
+            extent: ``w`` and ``h`` of the lens, converted to pixels of ``image``.
 
         Returns:
             The values, and a mask that is 1 where the image has data, shape (rows, columns, 1).

@@ -15,7 +15,8 @@ def batch(views: list[int], size: int | None, seed: int, iteration: int) -> list
     """
     n = len(views)
     if size is None or size >= n:
-        return views[::-1]  # The order affects the control variates of media. It is the same as in earlier versions.
+        # The order affects the control variates of media, so it stays as in earlier versions.
+        return views[::-1]
     number, k = divmod(iteration, -(-n // size))
     return [views[i] for i in _shuffled(seed, number, n)[k * size : (k + 1) * size]]
 

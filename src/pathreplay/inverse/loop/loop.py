@@ -118,9 +118,10 @@ def best_values(problem: Problem, run: Run) -> dict[str, Array]:
 def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
     """Take steps from ``len(run.history)`` to ``iterations``, and yield the events of the run.
 
-    After each step of the run, its baseline takes steps until the baseline has used as much time as the run. On a
-    machine whose load varies, this alternation gives the run and the baseline equal conditions. The steps of the
-    baseline use the learning rate and the resolutions of the run's current iteration.
+    A run may have a baseline: a second run, by another integrator, for comparison. After each step of the run, the
+    baseline takes steps until it has used as much time as the run. On a machine whose load varies, this alternation
+    gives both runs equal conditions. The steps of the baseline use the learning rate and the resolutions of the run's
+    current iteration.
 
     Args:
         problem: the problem.
@@ -286,7 +287,7 @@ def _norms(gradients: Arrays) -> dict[str, float]:
 
 
 def _seen(evaluations: Iterable[Evaluation], dropped: list[dict[str, int]]) -> Iterator[Evaluation]:
-    """Yield the evaluations and append their counts of dropped entries to ``dropped``."""
+    """Yield the evaluations, and append their counts of non-finite gradient entries to ``dropped``."""
     for evaluation in evaluations:
         dropped.append(evaluation.dropped)
         yield evaluation
@@ -311,7 +312,10 @@ def _summed(evaluations: Iterator[Evaluation], scale: float, halves: bool) -> tu
 
 
 def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int, loss: float) -> dict[str, Array]:
-    """Step the optimiser in the coordinates of each variable, and project the values onto their bounds."""
+    """Step the optimiser, and return the values after projection onto their bounds.
+
+    The optimiser steps in the `coordinates` of each variable, or in the values of variables without coordinates.
+    """
     config = part.problem.config
     decay, iterations = config.final_learning_rate_ratio, config.iterations
     factor = part.factor * rate(config.learning_rate_schedule, position, iterations, decay, config.warmup_steps)
@@ -353,7 +357,7 @@ def _plain(problem: Problem, view: View, spp: int) -> Image:
 
 
 def ended(problem: Problem, run: Run) -> Run:
-    """Return a copy of the run with `best_values`. Fit the exposures of test views in the copy and in its baseline."""
+    """Return a copy of the run with `best_values`. In the copy and its baseline, fit the exposures of test views."""
     run = replace(run, values=best_values(problem, run))
     for each in filter(None, (run, run.baseline)):
         each.values = dict(with_exposures(problem, each.values))
@@ -378,7 +382,7 @@ def image_error(problem: Problem, values: Arrays, iteration: int) -> float:
 
     Two independent renderings A and B of an image I satisfy E[(A - T)(B - T)] = (I - T)², whereas E[(A - T)²] would
     include the variance of A. The result is the square root of the mean over pixels and views, or 0 if the mean is
-    negative. It includes the noise of the targets T.
+    negative. The result includes the noise of the targets T.
 
     Args:
         problem: the problem.
