@@ -28,7 +28,7 @@ class FolderRun:
     """Writes a run folder; ``observe`` receives all events of the run.
 
     Args:
-        job: the job; the config of the problem replaces its config.
+        job: the job; its config is replaced by the config of the problem.
         problem: the problem.
         run: the run before its first iteration. If a folder is resumed, the run is restored from its checkpoint.
         stop: request to stop the run, which the stop button of the live page sets.
@@ -125,7 +125,7 @@ def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tu
 
 def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
     config = problem.config
-    held = {v.key for v in problem.variables} if config.stages else set()  # stages may freeze any of these variables
+    held = {v.key for v in problem.variables} if config.stages else set()  # a stage may freeze any variable
     before = go_on(folder.path, problem, run, held)
     # A run that has taken all its iterations can still lack a report, for example because the disk was full. It is
     # resumed only to write its results.

@@ -28,9 +28,9 @@ def value_and_grad(problem: Problem) -> ValueAndGrad:
         name; missing values are initial values. ``seed`` selects the sampled paths, and ``spp`` is the number of
         samples per pixel.
 
-        The loss is the mean over the training views plus regularizers. Noise in the images increases the loss, for
-        ``l2`` by their variance. The gradients have the shapes of the values and are unbiased for ``l2`` and
-        ``relative-l2``. Gradient entries that are NaN or infinite count as zero.
+        The loss is the mean over the training views plus regularizers. Noise in the images increases the loss; for
+        ``l2``, the increase is the variance of the images. The gradients have the shapes of the values and are unbiased
+        for ``l2``, ``relative-l2`` and ``display-l2``. Gradient entries that are NaN or infinite count as zero.
     """
     built = replace(problem.built, config=problem.built.config.model_copy(update={"stages": None}))
     config = built.config

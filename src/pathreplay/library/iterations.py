@@ -55,7 +55,7 @@ class Iteration:
 
     @property
     def errors(self) -> Mapping[str, float]:
-        """Return the RMS errors after the step of the parameters whose true value is known, by name."""
+        """Return the RMS errors after the step, by name, for all parameters whose true value is known."""
         return self.entry.errors
 
     def render(self, view: int | str = 0, spp: int | None = None) -> Image:

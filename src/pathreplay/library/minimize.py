@@ -174,7 +174,7 @@ def _minimized(
 
 
 def _run(problem: Problem, built: inner.Problem, own: object, stack: ExitStack, bar: Progress | NotebookPanel) -> Run:
-    """Create the run; the user's optimizer, if any (``own``), replaces the configured one."""
+    """Create the run. The user's optimizer ``own``, if there is one, replaces the configured optimizer."""
     config = built.config
     pool = stack.enter_context(crew_of(config, problem.base, built, bar.remark, bar.status))
     run = run_of(built, pool)
@@ -201,7 +201,10 @@ def _folder_run(
 def _observers(
     bar: Progress | NotebookPanel, built: inner.Problem, run: Run, stop: Stop, kept: FolderRun | None
 ) -> list[Callable[[Event], None]]:
-    """Return the observers other than the progress display: the run folder or, without it, images for a notebook."""
+    """Return the observers of events, other than the progress display.
+
+    If there is a run folder, its writer is the observer. Otherwise, a notebook has an observer that renders images.
+    """
     if kept is not None:
         if isinstance(bar, NotebookPanel):
             bar.follow(kept.previews.pictures, str(kept.folder.name))

@@ -68,7 +68,7 @@ class OfMitsuba:
         return {}
 
     def state(self) -> State:
-        """See `Optimiser`. The arrays are Dr.Jit's additional state per variable, such as moments, named NUMBER:KEY."""
+        """See `Optimiser`. The arrays, named NUMBER:KEY, are Dr.Jit's state of the variables, such as moments."""
         kept = {key: _leaves(self._optimizer.state[key][3:]) for key in self._steps}
         arrays = {f"{n}:{key}": np.array(leaf) for key, leaves in kept.items() for n, leaf in enumerate(leaves)}
         return State(dict(self._steps), arrays)
@@ -187,7 +187,7 @@ def options_of(optimizer: object) -> tuple[Json | None, object]:
     if hasattr(optimizer, "step"):
         return None, optimizer
     if callable(optimizer):
-        return {"type": "l-bfgs-b"}, optimizer  # a job runs any such function with the settings of L-BFGS-B
+        return {"type": "l-bfgs-b"}, optimizer  # `LineSearch` runs such functions in place of L-BFGS-B
     raise PathreplayError(
         f"optimizer: {type(optimizer).__name__} has no step(); give a name such as 'adam', an optimizer of "
         "mitsuba.ad, an object with step(values, gradients, learning_rates, loss), or a function like "

@@ -24,7 +24,7 @@ from pathreplay.library.problem import Problem, run_settings
 class _Task:
     """Settings, kernels and optimiser that all states of an optimisation share.
 
-    ``at`` is the state whose optimiser state is loaded; None if it is unknown.
+    The optimiser has the internal state that belongs to the `State` ``at``, or to an unknown `State` if ``at`` is None.
     """
 
     def __init__(self, changes: Mapping[str, object]) -> None:
@@ -49,7 +49,7 @@ class _Task:
         if self.optimiser is None or self.at is not state:
             self.optimiser = self.own or optimiser_of(built, state._next, built.config.optimizer)
             self.optimiser.restore(state._kept, latents(built.variables, state._next))
-        self.at = None  # if the step fails, the state of the optimiser belongs to no `State`
+        self.at = None  # unknown until the step that follows has succeeded
         return self.optimiser
 
 

@@ -15,9 +15,9 @@ _SOURCES = (".exr", ".md", ".py", ".sh", ".toml", ".xml")
 
 
 def example_files() -> list[Path]:
-    """Return the source files of the examples, each of which is in the folder of its example.
+    """Return the source files of the examples. Each example has a folder of its own.
 
-    An installed package contains the examples. In a checkout they are in the root folder.
+    An installed package contains these folders. In a checkout, they are in the folder ``examples`` of the repository.
 
     Raises PathreplayError if there are no examples.
     """

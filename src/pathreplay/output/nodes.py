@@ -130,7 +130,7 @@ def _join(state: mi.parser.ParserState, name: str, camera: mi.parser.ParserState
 
 def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes: list[Node]) -> list[Owner]:
     """Return the owners of all parameters, from an instance of the scene in which each object has a unique id."""
-    copy = mi.parser.ParserState(state)  # instantiation would replace references by objects
+    copy = mi.parser.ParserState(state)  # a copy, in which instantiation replaces references by objects
     names = {f"object {i}": i for i in range(1, len(nodes))}
     for name, i in names.items():
         copy.nodes[i].props.set_id(name)

@@ -27,7 +27,7 @@ _ALSO_PLACES = {
 }
 """Properties by plugin whose effect `mi.traverse` includes in `to_world`. An exported `to_world` replaces them."""
 
-# Materials and emitters of `mi.Mesh` objects that can be exported. Class name -> plugin, and all properties to export.
+# Materials and emitters of `mi.Mesh` objects that can be exported, by class name: their plugin and its properties.
 _KNOWN: dict[str, tuple[str, tuple[str, ...]]] = {
     "SmoothDiffuse": ("diffuse", ("reflectance",)),
     "SmoothConductor": ("conductor", ("eta", "k", "specular_reflectance")),
@@ -132,8 +132,8 @@ class Placing:
     def _known(self, instance: mi.Object, what: str) -> mi.Properties:
         """Describe a loaded material or emitter by properties.
 
-        Supported objects are glass, and diffuse materials, conductors and area lights of constant colour. Raises
-        PathreplayError for all other objects.
+        Glass is supported. Diffuse materials, conductors and area lights are supported if their colours are constant.
+        Raises PathreplayError for all other objects.
         """
         params = mi.traverse(instance)
         if instance.class_name() == "SmoothDielectric" and params.keys() == {"eta"}:

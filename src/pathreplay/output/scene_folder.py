@@ -103,7 +103,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
         raise PathreplayError("The scene differs each time it is loaded, and cannot be exported")
     placing = Placing(described, scene, _file_names(keys, scene))
     for key, owner in zip(keys, owners, strict=True):
-        if owner.node is described.nodes[0]:  # a parameter of an existing mesh object, which `meshes` handles
+        if owner.node is described.nodes[0]:  # the parameter belongs to an existing mesh object: `meshes` writes it
             continue
         if key in values or (owner.place == "data" and made_otherwise(owner.node)):
             placing.put(key, owner)

@@ -1,4 +1,7 @@
-"""Second-order optimisers in the loop: their choice of random numbers, and the Gauss-Newton model of an iteration."""
+"""Connects second-order optimisers to the optimisation loop.
+
+`draw_of` selects the random numbers of an iteration. `observe` passes the Gauss-Newton model to the optimiser.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +17,15 @@ from pathreplay.inverse.problem.problem import Problem
 
 
 def draw_of(optimiser: Optimiser, iteration: int, searches: bool) -> tuple[int, bool]:
-    """Return the index of the random numbers of an iteration, and whether its shards are of second order (see `Shard`).
+    """Select the random numbers of an iteration, and whether its Gauss-Newton model is evaluated.
 
     Args:
         optimiser: the optimiser.
-        iteration: the iteration.
+        iteration: index of the iteration.
         searches: whether all iterations use the same random numbers, see `Optimizer.searches`.
+
+    Returns:
+        An index and the value of `Shard.second_order`. Iterations with the same index use the same random numbers.
     """
     if isinstance(optimiser, LevenbergMarquardt):
         return optimiser.draw, True
@@ -29,7 +35,7 @@ def draw_of(optimiser: Optimiser, iteration: int, searches: bool) -> tuple[int, 
 def observe(problem: Problem, optimiser: Optimiser, values: Arrays, evaluation: Evaluation) -> None:
     """Pass the Gauss-Newton model of an evaluation to a second-order optimiser.
 
-    The model includes the regularizers. It is a function of the latent variables that the optimiser steps.
+    The model includes the regularizers. It is expressed in the latent variables, which the optimiser steps.
     """
     model = evaluation.model
     if not isinstance(optimiser, LevenbergMarquardt) or model is None:

@@ -1,10 +1,11 @@
 """Identifiability: parameters that do not affect the images, and pairs of parameters whose effects cancel.
 
-The Jacobian J of all images with respect to some entries of each parameter is computed by central differences with
-common random numbers. Equivalent changes therefore have equal columns in J, including the noise. For example, moving a
-camera is equivalent to moving everything else in the opposite direction.
+The Jacobian J of all images is computed by central differences. A parameter has one column of J per entry, or a single
+column if it has many entries. All renderings use the same random numbers. If two changes have the same effect on the
+images, their columns of J are therefore equal, including the noise. For example, moving a camera has the same effect as
+moving everything else in the opposite direction.
 
-The test computes the smallest principal angle between the column spaces of two parameters. If the angle is zero, a
+`trade_offs` computes the smallest principal angle between the column spaces of two parameters. If the angle is zero, a
 change of one parameter can be undone by a change of the other parameter, and the images determine only the combined
 effect. An example is the radiance of an emitter and the reflectance of the surface that the emitter lights.
 """
@@ -55,7 +56,7 @@ def trade_offs(columns: Columns) -> tuple[tuple[str, str], ...]:
 
 
 def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Columns, tuple[str, ...]]:
-    """Compute the columns of the Jacobian for all variables except exposures.
+    """Compute the columns of the Jacobian for all variables except exposures and the camera response.
 
     Args:
         problem: the problem.
@@ -95,7 +96,10 @@ def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Colu
 
 
 def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
-    """Render all training views with common random numbers. Returns the weighted pixels of all views in one vector."""
+    """Render all training views with common random numbers.
+
+    Returns the pixels of all views in one vector, multiplied by the square roots of their weights.
+    """
     pictures = []
     for view in problem.trained().values():
         picture = picture_of(problem, values, view, spp)
@@ -113,5 +117,5 @@ def _changes(variable: Variable, value: Array, few: int = FEW) -> list[Array]:
 
 
 def _length(value: Array) -> float:
-    """Compute the root mean square."""
+    """Compute the root mean square of the entries of a value."""
     return float(np.sqrt(np.mean(np.square(value, dtype=np.float64))))

@@ -1,4 +1,4 @@
-"""Assessment of a run: which variables still move, have converged, or are not determined by the images."""
+"""Assessment of a run: which variables still move, which have converged, and which the images do not determine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from pathreplay.inverse.problem.problem import Problem
 
 @dataclass(frozen=True)
 class Verdict:
-    """Keys of variables, grouped by state. Variables in none of the groups had too few iterations for a test."""
+    """Keys of variables, grouped by state.
+
+    If a variable is in none of the groups, the run had too few iterations to test whether the variable still moves.
+    """
 
     moving: tuple[str, ...] = ()
     """Variables that still move."""
@@ -29,7 +32,7 @@ class Verdict:
     """Variables that do not affect the images."""
 
     def __str__(self) -> str:
-        """Summarise the verdict in one line, with remedies."""
+        """Summarise the verdict in one line, which also suggests what to change."""
         parts = []
         if self.trade_offs:
             pairs = ", ".join(f"'{a}' against '{b}'" for a, b in self.trade_offs)
@@ -54,7 +57,10 @@ def _listed(keys: Sequence[str]) -> str:
 
 
 def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
-    """Assess a run. If it was ``stopped`` early, trade-offs are not computed, because they need renderings."""
+    """Assess a run.
+
+    If the run was ``stopped`` early, the groups ``trade_offs`` and ``unseen`` stay empty, because they need renderings.
+    """
     moves = {v.key: still_moves(run.history, v.key, _begin(problem, v.key, run)) for v in problem.variables}
     known = [key for key, moving in moves.items() if moving is not None]
     done = bool(run.optimiser.finished)
@@ -69,16 +75,16 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
         columns, unseen = columns_of(problem, run.values, taken)
         pairs = trade_offs(columns)
     except (PathreplayError, RuntimeError, ValueError, np.linalg.LinAlgError):
-        # User functions or Mitsuba may reject perturbed values. This is no error of the run, which has succeeded.
+        # User functions or Mitsuba may reject perturbed values. The run itself has succeeded, so no error is reported.
         return Verdict(moving, arrived)
-    # Variables with a nonzero gradient affect the images. The finite differences of `columns_of` may be zero
-    # nevertheless, if the perturbation moves no silhouette across a sample.
+    # Variables with a nonzero gradient affect the images, even if their finite differences in `columns_of` are zero.
+    # The differences are zero if the perturbation moves no silhouette across a sample.
     pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
     return Verdict(moving, arrived, pairs, tuple(key for key in unseen if key not in pulled))
 
 
 def _begin(problem: Problem, key: str, run: Run) -> int:
-    """Return the first iteration of the current stage or resolution of a variable, whichever began later."""
+    """Return the iteration since which neither the stage of the job nor the resolution of a variable has changed."""
     stages = begins(problem.config.stages or [])[:-1]
     levels = next(v.levels for v in problem.variables if v.key == key)
     return max(at for at in (0, *stages, *(levels.begins if levels else ())) if at <= len(run.history))

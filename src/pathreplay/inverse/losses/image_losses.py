@@ -19,7 +19,7 @@ from pathreplay.scenes.descriptions import one_line
 if TYPE_CHECKING:
     import torch
 
-# Term in the denominator of the scale factor s, relative to the target's mean square. Nearly black images get s ≈ 0.
+# Fraction of Σ w T² that is added to the denominator of s in `scale_invariant`. Nearly black images get s ≈ 0.
 _BLACK = 1e-9
 
 
@@ -53,7 +53,7 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 def _encoded(image: mi.TensorXf) -> mi.TensorXf:
-    """Apply the sRGB transfer function, extended above white."""
+    """Apply the sRGB transfer function. Values above 1 are not clipped, but use the same formula."""
     bright = dr.maximum(image, 0.0031308)  # the unselected branch must have a finite derivative, too
     return dr.select(image > 0.0031308, 1.055 * dr.power(bright, 1 / 2.4) - 0.055, 12.92 * dr.maximum(image, 0))
 
@@ -70,7 +70,7 @@ def _blurred(image: mi.TensorXf) -> mi.TensorXf:
         values = image.array
         mean = mi.Float(0)
         for offset, w in zip(offsets, window, strict=True):
-            # Mirroring makes the image periodic with period 2 n: forwards, then backwards.
+            # Mirroring repeats the n pixels with period 2 n: first in their order, then in reverse order.
             tap = (position + int(offset % (2 * n))) % (2 * n)
             tap = dr.select(tap < n, tap, 2 * n - 1 - tap)
             mean += dr.gather(mi.Float, values, at + (tap - position) * stride) * float(w)

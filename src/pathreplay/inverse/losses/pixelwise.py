@@ -4,9 +4,9 @@ A loss f(I, T) compares the rendered image I with the target T. The optimiser mi
 pixels and channels.
 
 The gradient is the product of f'(I, T) and the derivative of I, which are estimated from independent samples (see
-`frozen`). It is therefore unbiased if f' is linear in I, as for ``l2``, ``relative-l2`` and ``display-l2``. Noise in I
-biases the gradients of the other losses, and more samples per pixel reduce the bias. These losses are useful where
-outliers would dominate ``l2``. Losses that couple pixels are in `image_losses`.
+`frozen`). The gradient is therefore unbiased if f' is linear in I, as for ``l2``, ``relative-l2`` and ``display-l2``.
+Noise in I biases the gradients of all other losses. More samples per pixel reduce the bias. The losses with biased
+gradients are useful where outliers would dominate ``l2``. Losses that couple pixels are in `image_losses`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Loss: TypeAlias = "Callable[..., mi.TensorXf]"
 # Floor (radiance) that is added to the denominators of relative losses: about 1 % of display white.
 RELATIVE_FLOOR = 1e-2
 
-# Radiance below which the weights of `display_l2` are constant.
+# Radiance of the target, below which the factor s'(T) of `display_l2` is constant.
 DISPLAY_FLOOR = 1e-2
 
 
@@ -49,7 +49,9 @@ def relative_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 def display_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Compute ((I - T) s'(T))², where s' is the derivative of the sRGB encoding at T, clamped to [0.01, 1].
+    """Compute ((I - T) s'(T))², where s' is the derivative of the sRGB encoding.
+
+    The argument T of s' is clamped to [0.01, 1].
 
     To first order, this is the squared difference of images on a display. The gradient is unbiased, as for ``l2``.
     """

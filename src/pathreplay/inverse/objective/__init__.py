@@ -1,1 +1,1 @@
-"""The objective: loss and gradients as a function of values and of a shard of the views."""
+"""The objective: loss and gradients as a function of the values, evaluated for some of the views at a time."""

@@ -1,4 +1,8 @@
-"""Evaluation of loss and gradient: shards of an iteration, the evaluator of a scene, and executors."""
+"""Evaluates loss and gradient.
+
+An iteration is split into shards. An `Evaluator` computes loss and gradient of a shard. An `Executor` passes all shards
+of an iteration to evaluators, in this process or in others.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +89,7 @@ Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]
 
 
 class Total:
-    """Running sum of evaluations, whose summands can be freed after they have been added."""
+    """Running sum of evaluations. Each evaluation can be freed after it has been added."""
 
     def __init__(self, owned: bool = False) -> None:
         self._owned, self._count, self._loss = owned, 0, 0.0
@@ -110,14 +114,17 @@ class Total:
         self._count += 1
 
     def _room(self, key: str) -> Array | None:
-        """Return the array of a sum, or None if it must not be overwritten (e.g. read-only, from another process)."""
+        """Return the array with the sum of the gradients of a variable, to which the next sum may be written.
+
+        Returns None if the array must not be overwritten, for example read-only memory from another process.
+        """
         here = self._sums[key]
         return here if self._owned and here.flags.writeable else None
 
     def of(self, share: float = 1.0) -> Evaluation:
-        """Return the sum of losses and gradients, times ``share``, and the mean of the learned states.
+        """Return the sum of losses and gradients, times ``share``, and the mean of the integrator's states.
 
-        All evaluations of an iteration start from the same learned state, so they can run concurrently.
+        All evaluations of an iteration start from the same state of the integrator, so they can run concurrently.
         """
         sums, known = self._sums, self._known
         if share != 1:
@@ -182,7 +189,7 @@ def owned_tensor(picture: Array) -> mi.TensorXf:
 
 
 class Evaluator:
-    """Evaluates shards of a problem with one integrator. After a call, the scene contains the values of the shard.
+    """Evaluates shards of a problem with one integrator. After a call, the scene contains the values of this call.
 
     Only the variables ``moving`` (default: all) are differentiated. Views are rendered and back-propagated one by one,
     which limits memory to the AD graph of a single view.
@@ -199,14 +206,15 @@ class Evaluator:
         self._moving = frozenset((v.key for v in problem.variables) if moving is None else moving)
         self._reached = problem.reached(self._moving)
         has_media = facts_of(problem.scene).has_media
-        # Deterministic jobs do not record passes: recorded kernels are split differently, which changes the last bit.
+        # Deterministic jobs do not record passes: recording splits kernels differently, and thus changes the last bit
+        # of results.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(self.integrator, has_media) and problem.loss not in ELSEWHERE
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # Keys: samples per pixel.
         # Whether one pass computes image and gradient. Keys: view, samples per pixel, and whether pixels are batched.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
         self._learned: Arrays = {}  # State of the integrator after the last evaluation.
-        self._at: object = None  # `integrator.baseline` then; another evaluator may replace it in the integrator.
+        self._at: object = None  # `integrator.baseline` after the last evaluation. Another evaluator may replace it.
         self._begun = False
         self._jacobians: Jacobians | None = None
 
@@ -228,7 +236,7 @@ class Evaluator:
         return total(each(), owned=True)
 
     def _know(self, learned: Arrays) -> None:
-        """Load the learned state. Raises PathreplayError if the state belongs to another kind of integrator."""
+        """Load the state ``learned`` into the integrator. Raises PathreplayError if the kinds of integrator differ."""
         held = self.integrator.baseline
         if (learned is self._learned and held is self._at) or (held is None and not learned):
             return
@@ -262,7 +270,7 @@ class Evaluator:
             factor = factor_of(values, view, about.target.shape[2])
             batch = None if pixels is None else Batch.of(about.weight, about.target.shape[:2], pixels, seed)
             loss, by_factor, by_target = self._differentiated(values, view, seed, spp, factor, batch)
-        except NotRecordable:  # a part of the gradient may have been added: start again from zero
+        except NotRecordable:  # a part of the gradient may have been added: start again with a zero gradient
             self.freezes = False
             return self._view(values, view, seed, spp, pixels)
         gradients = {}

@@ -48,7 +48,7 @@ class ViewTarget:
     """Factor on the rendered image, see `exposures`."""
 
     def compared(self, loss: Loss, image: mi.TensorXf) -> mi.Float:
-        """Multiply a rendered image by the factor, and return its mean loss."""
+        """Multiply a rendered image by the factor, and return the mean loss of the product."""
         return mean_loss(loss, _times(image, self.factor), self.target, self.weight).array
 
 
@@ -102,11 +102,14 @@ def is_recordable(integrator: StatefulIntegrator, has_media: bool) -> bool:
 
 
 class Recordings:
-    """Frozen versions of `differentiate`, by view, shapes of the parameters, and constants of the kernels."""
+    """Frozen versions of a function, such as `differentiate`.
+
+    There is one version for each combination of view, shapes of the parameters, and `SceneFacts.constants`.
+    """
 
     def __init__(self) -> None:
         self._frozen: dict[Hashable, Callable[..., Any]] = {}
-        self._made: Counter[Hashable] = Counter()  # recordings by view and shapes
+        self._made: Counter[Hashable] = Counter()  # number of recordings, by view and shapes of the parameters
 
     def differentiate(
         self,
@@ -128,10 +131,10 @@ class Recordings:
         """Call a frozen function of a scene.
 
         Args:
-            view: identifies the function.
-            make: creates the function; called once for each set of the scene's constants.
-            scene: its first argument.
-            *args: further arguments.
+            view: key of the function.
+            make: creates the function; called once for each key and each value of `SceneFacts.constants`.
+            scene: first argument of the function.
+            *args: further arguments of the function.
 
         Raises:
             NotRecordable: a plugin of the scene prevents the recording, or the constants changed too often.
@@ -226,12 +229,12 @@ def _halves(view: Pass) -> list[Pass]:
 def _extrapolated(
     loss: Loss, target: ViewTarget, images: list[mi.TensorXf], shares: list[float]
 ) -> tuple[mi.Float, mi.TensorXf]:
-    """Return the loss of the mean image, extrapolated from the losses of independent ``images``; and the mean image.
+    """Return the loss that is extrapolated to an image without noise, and the mean of the independent ``images``.
 
     The bias of a smooth loss f at an image of N samples is c / N + O(1 / N²). Let the image I_i have the share s_i of
     the N samples. The bias of f(I_i) is then c / (s_i N) to first order. For two images, the terms c / N therefore
-    cancel in 2 f(Σ s_i I_i) - Σ s_i f(I_i) (jackknife). All images have the same expectation, so the adjoint of this
-    expectation is the sum of the adjoints of the images.
+    cancel in 2 f(Σ s_i I_i) - Σ s_i f(I_i) (jackknife). All I_i have the same expected image. The derivative of the
+    loss with respect to the expected image is therefore the sum of the derivatives with respect to the I_i.
     """
     if len(images) == 1:
         return target.compared(loss, images[0]), images[0]

@@ -1,7 +1,7 @@
 """Image of a view and its derivatives with respect to every entry of the variables, from forward passes.
 
 Image and derivatives are computed twice, from two independent halves of the samples. Each entry takes one forward pass
-per half. The pass uses the same random numbers as the image of this half.
+per half. The forward pass uses the same random numbers as the image of its half.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class Jacobians:
         return Half((image if factor is None else image * factor) - target, jacobian)
 
     def _carry(self, variables: dict[str, dr.ArrayBase], key: str, unit: dr.ArrayBase) -> None:
-        """Attach one variable, and propagate a tangent from it to the scene."""
+        """Enable the gradient of one variable only, and propagate the tangent ``unit`` from it to the scene."""
         dr.disable_grad(variables)
         dr.enable_grad(variables[key])
         dr.set_grad(variables[key], unit)
@@ -136,7 +136,10 @@ class Jacobians:
         dr.forward_from(variables[key], dr.ADFlag.ClearEdges)
 
     def _pass(self, key: str, view: int, request: RenderRequest) -> Array:
-        """Render the image, or its derivative along the tangent of a variable. Later calls use a recorded pass."""
+        """Render the image, or its derivative along the tangent of a variable.
+
+        If passes are recorded, each call except the first for a key and a view uses a recorded pass.
+        """
         scene, integrator, run = self.problem.scene, self.integrator, _image if key == IMAGE else _tangent
         state = integrator.begin(scene)
         # The first call is not recorded: see `Evaluator`.

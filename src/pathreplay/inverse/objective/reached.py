@@ -17,7 +17,7 @@ from pathreplay.inverse.problem.problem import Problem, scene_values, variables_
 
 
 def require_possible(problem: Problem) -> None:
-    """Raise PathreplayError unless all stages of a problem are possible.
+    """Raise PathreplayError unless all stages of a problem can be run.
 
     See `require_stages`, `require_single_pixels` and `require_reached`.
     """
@@ -37,7 +37,7 @@ def require_reached(problem: Problem) -> None:
         where = f"stages: stage {part.number + 1}: " if part.stage else ""
         views = part.problem.trained()
         reached = sorted(views.keys() & part.problem.reached(part.moving))
-        if not reached and part.moving.isdisjoint({EXPOSURE, RESPONSE}):  # these change the comparison of every image
+        if not reached and part.moving.isdisjoint({EXPOSURE, RESPONSE}):  # both affect the loss of all views
             names = _listed(view.name for view in views.values())
             raise PathreplayError(
                 f"{where}{_listed(sorted(part.problem.moves(part.moving)))} affects none of the training views "
@@ -49,7 +49,7 @@ def require_reached(problem: Problem) -> None:
 
 
 def _require_differentiated(part: Part, sensor: int, where: str) -> None:
-    """Raise PathreplayError if the integrator or the baseline of the problem treats the variables as constants."""
+    """Raise PathreplayError if the integrator, or the one of the baseline run, treats the variables as constants."""
     problem = part.problem
     variables = variables_of(problem, {v.key: v.start for v in problem.variables})
     dr.enable_grad({key: value for key, value in variables.items() if key in part.moving})

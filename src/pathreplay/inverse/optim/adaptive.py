@@ -105,7 +105,10 @@ class DrJitOptimiser:
         return self._parts[self._is_uniform(key)]
 
     def _pieces(self, key: str) -> dict[str, slice]:
-        """Return the pieces of a variable by name in Dr.Jit's optimiser. UniformAdam needs a single piece."""
+        """Return the slices of the pieces of a variable. Their keys name the pieces in Dr.Jit's optimiser.
+
+        A variable of UniformAdam is a single piece.
+        """
         size = prod(self._shapes[key])
         length = max(size, 1) if self._is_uniform(key) else self._piece
         return {f"{key}:{begin}": slice(begin, min(begin + length, size)) for begin in range(0, size, length)}

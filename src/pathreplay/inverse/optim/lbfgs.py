@@ -1,7 +1,7 @@
 """Adapter of SciPy's minimisers, such as L-BFGS-B, to the `Optimiser` interface.
 
-Each iteration of a job is one function evaluation. It may be a trial step of the line search, whose loss may exceed the
-previous loss. The result of a run is the evaluation with the lowest loss.
+Each iteration of a job is one function evaluation. The evaluation may be a trial step of the line search, so its loss
+may exceed the previous loss. The result of a run is the evaluation with the lowest loss.
 
 SciPy's minimisers do not expose their state, but they are deterministic. Each iteration therefore restarts the
 minimiser and replays the recorded evaluations, until the minimiser requests a new evaluation. The replay takes

@@ -1,17 +1,19 @@
 """Levenberg-Marquardt steps on noisy Gauss-Newton models: a search on common random numbers, then averaging.
 
 *Search.* All evaluations use the same random numbers, so that losses can be compared. A step solves
-(H + λ diag H) δ = -g within the bounds. It is rejected if the loss grows by more than the noise along the step,
-√(δᵀΣδ), with the covariance Σ of the gradient. λ falls after good steps and grows after rejected ones.
+(H + λ diag H) δ = -g within the bounds. The step is rejected if the loss grows by more than the noise along the step,
+√(δᵀΣδ), with the covariance Σ of the gradient. λ falls after good steps and grows after rejected steps.
 
-*Averaging.* The noise of g displaces the minimiser by a random vector with the covariance H⁻¹ΣH⁻¹. On average, this
-raises the loss by ν = ½ tr(H⁻¹Σ). The search ends when the predicted decrease of the loss is below a fraction of ν, or
-when steps do not lower the loss by more than its noise. From then on, each evaluation uses new random numbers, and H
-and Σ are weighted means over the evaluations. The k-th of these evaluations takes the step 2 δ / (k + 2).
+*Averaging.* The noise of g displaces the minimum of the model by a random vector with the covariance H⁻¹ΣH⁻¹. On
+average, this displacement raises the loss by ν = ½ tr(H⁻¹Σ). The search ends when the predicted decrease of the loss is
+below a fraction of ν, or when steps do not lower the loss by more than its noise. After the search, each evaluation
+uses new random numbers, and H and Σ are weighted means over the evaluations since the search. After the k-th of these
+evaluations, the optimiser takes the step 2 δ / (k + 2).
 
-The values are then a weighted mean of the minimisers of these evaluations, with weights proportional to k. Their error
-decreases like 1/√k. It is 15 % larger than with equal weights, but the influence of the result of the search decreases
-like 1/k² instead of 1/k. If the predicted decrease is very large twice in succession, the search begins again.
+The values are then a weighted mean of the minima that these evaluations predict. The weight of the k-th evaluation is
+proportional to k + 1. The error of the mean decreases like 1/√k, and is 15 % larger than with equal weights. In return,
+the influence of the values at the end of the search decreases like 1/k². With equal weights, this influence would
+decrease like 1/k. If the predicted decrease of the loss is very large twice in succession, the search begins again.
 """
 
 from __future__ import annotations
@@ -70,7 +72,10 @@ REASON = "the noise of the values affects the loss less than the tolerance"
 
 @dataclass(frozen=True)
 class Point:
-    """An evaluation: flat values, loss without the variance of images, gradient and model."""
+    """An evaluation: values in a flat array, loss, gradient and model.
+
+    The loss excludes the expected contribution of the noise of the images (`GaussNewton.excess`).
+    """
 
     at: Matrix
     loss: float
@@ -120,7 +125,7 @@ class LevenbergMarquardt:
         self._count, self._far, self._restarts, self._first = 0, 0, 0, 0.0
 
     def observe(self, model: GaussNewton) -> None:
-        """Receive the model of the loss at the values of the next `step`, in the order of its gradients."""
+        """Receive the model of the loss at the values that the next `step` gets, with variables in the same order."""
         self._model = model
 
     def step(
@@ -142,7 +147,7 @@ class LevenbergMarquardt:
         return self._split(self._next)
 
     def _search(self, seen: Point) -> None:
-        """Accept or reject a step on common random numbers, and propose the next one."""
+        """Accept or reject a step on common random numbers, and propose the next step."""
         lowered = True
         if self._base is None:
             self._base, self._first = seen, self._first or abs(seen.loss)
@@ -162,7 +167,10 @@ class LevenbergMarquardt:
             self._next = base.at + step
 
     def _judge(self, base: Point, seen: Point) -> bool:
-        """Accept or reject a step and adapt the damping; returns whether it lowered the loss beyond its noise."""
+        """Accept or reject a step, and adapt the damping.
+
+        Returns whether the step lowered the loss by more than the noise along the step.
+        """
         moved, gain = seen.at - base.at, base.loss - seen.loss
         noise = math.sqrt(max(float(moved @ base.model.noise @ moved), 0.0)) + ROUNDING * abs(base.loss)
         self._stalls = self._stalls + 1 if abs(gain) <= noise else 0
@@ -188,7 +196,7 @@ class LevenbergMarquardt:
         assert self._base is not None
         share = 2 / (self._count + 2)
         model = self._base.model.times(1 - share) + seen.model.times(share)
-        # This is the mean of the covariances. `times` would give the covariance of the mean gradient.
+        # Average the covariances. `GaussNewton.times` gives the covariance of the mean gradient instead.
         noise = self._base.model.noise * (1 - share) + seen.model.noise * share
         point = replace(seen, model=replace(model, noise=noise))
         step, promise = self._solved(point, self._damping)
@@ -209,7 +217,7 @@ class LevenbergMarquardt:
         self._end()
 
     def _end(self) -> None:
-        """Finish if the noise of the values affects the loss less than the tolerance."""
+        """Finish if the noise of the values raises the loss by less than the tolerance."""
         assert self._base is not None
         if self._tolerance and self._excess(self._base.model) / self._count < self._tolerance * self._first:
             self.finished = REASON
@@ -241,7 +249,7 @@ class LevenbergMarquardt:
         return step, float(-point.gradient @ step - 0.5 * step @ model @ step)
 
     def _excess(self, model: GaussNewton) -> float:
-        """Return ν, the mean increase of the loss at the minimiser due to the noise of one evaluation.
+        """Return ν, the mean increase of the loss when the noise of one evaluation displaces the minimum of the model.
 
         Directions in which the loss hardly changes, such as the common scale of exposures, do not contribute.
         """
@@ -312,10 +320,11 @@ class LevenbergMarquardt:
 
 
 def _positive(model: GaussNewton) -> Matrix:
-    """Clip the eigenvalues of H relative to `GaussNewton.robust` to an interval, and return the resulting matrix.
+    """Return H with its eigenvalues clipped to an interval, which makes H positive.
 
-    The lower limit is the relative noise of H, estimated from its diagonal. The upper limit is `LARGEST`, which bounds
-    the effect of outliers.
+    The eigenvalues are relative to the matrix `GaussNewton.robust` (generalised eigenvalues). The lower limit is the
+    relative noise of H, which is estimated from its diagonal. The upper limit is `LARGEST`, which bounds the effect of
+    outliers.
     """
     scale = _scale(model)
     used = scale > 0

@@ -131,14 +131,14 @@ def _named(
 
 
 def _at_level(variable: Variable, k: int) -> Array:
-    """Resample the initial value of a variable to its k-th resolution, or to the last one."""
+    """Resample the initial value of a variable to its k-th resolution, or to its last if it has fewer resolutions."""
     if variable.levels is None:
         return variable.start
     return resampled(variable.start, variable.levels.shapes[min(k, len(variable.levels.shapes) - 1)])
 
 
 def _require(derived: Derived, variables: dict[str, SceneValue]) -> None:
-    """Raise PathreplayError unless the value is finite and depends on all of its variables."""
+    """Raise PathreplayError unless the value of a derived parameter is finite and depends on all of its variables."""
     derived.require_finite(variables)
     for name, variable in variables.items():
         dr.enable_grad(variable)

@@ -27,8 +27,9 @@ EXPOSURE = "exposure"
 class Factors:
     """Logarithmic coordinates (`Coordinates`) of the factors, with a fixed common scale.
 
-    After each step, the mean logarithm over the rows ``fixed`` is subtracted for each colour, which keeps the geometric
-    mean of these rows at 1. If ``fixed`` is empty, nothing is subtracted and the common scale is free.
+    The argument ``fixed`` contains indices of views. After each step, the mean logarithm of the factors of these views
+    is subtracted for each colour, which keeps the geometric mean of these factors at 1. If ``fixed`` is empty, nothing
+    is subtracted and the common scale is free.
     """
 
     uniform = False
@@ -143,7 +144,10 @@ def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Imag
 
 
 def fixed_rows(names: Iterable[str], trained: Iterable[int], reference: str | None, free: bool) -> list[int]:
-    """Return the rows whose mean `Factors` fixes: the reference view or all training views, or no row if ``free``."""
+    """Return the indices of the views whose mean factor is fixed, for the argument ``fixed`` of `Factors`.
+
+    These are the reference view if there is one, or else all training views. The list is empty if ``free``.
+    """
     if free:
         return []
     return list(trained) if reference is None else [list(names).index(reference)]

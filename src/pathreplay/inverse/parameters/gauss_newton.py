@@ -43,7 +43,10 @@ class Half:
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Model of a loss as a function of all entries of its variables. The model of a sum is the sum of the models."""
+    """Model of a loss as a function of all entries of its variables.
+
+    The sum of the models of two losses is the model of the sum of the losses.
+    """
 
     sizes: dict[str, int]
     """Number of entries of each variable, in the order of the matrices."""

@@ -182,7 +182,7 @@ def laplacian(positions: ArrayLike, faces: ArrayLike) -> Callable[[mi.TensorXf],
 
 
 def _differentiable(term: Term, values: mi.TensorXf) -> mi.TensorXf:
-    """Evaluate a term as a Dr.Jit tensor that is differentiable once."""
+    """Evaluate a term as a Dr.Jit tensor that has first derivatives, but no second derivatives."""
     value, slope = term(np.array(dr.detach(values)))
     linear = dr.sum((values - dr.detach(values)) * mi.TensorXf(slope.astype(np.float32)), axis=None)
     return linear + value

@@ -1,16 +1,16 @@
-"""The camera response: a monotone curve, shared by all views, that maps stored values to radiance.
+"""The inverse g of the camera response: a monotone curve, shared by all views, that maps stored values to radiance.
 
-A camera stores a value T for the product e I of exposure and radiance. The loss compares e I with g(T), where g is the
-inverse of the response. Images are decoded from sRGB when they are read, so g is the identity for an sRGB camera. With
-g on the side of the target, the loss stays quadratic in the rendered image, and its gradient unbiased.
+A camera stores a value T for the product e I of exposure and radiance. The loss compares e I with g(T). Images are
+decoded from sRGB when they are read, so g is the identity for an sRGB camera. Because g is applied to the target, the
+loss stays quadratic in the rendered image, and its gradient stays unbiased.
 
 Two forms of g are supported, both with g(0) = 0 and g(1) = 1:
 
     gamma    g(T) = T^γ
     curve    g(T) = s⁻¹(y(s(T))), where s is the sRGB encoding, and y is monotone and linear between its knots
 
-The derivative with respect to g is taken at fixed weights: a relative loss divides by the target, but must not shrink
-by brightening it.
+The derivative with respect to g is taken at fixed weights. A relative loss divides by the target, so without fixed
+weights, a curve g that brightens the target would reduce the loss.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ SMALLEST = 1e-6
 
 
 class Increments:
-    """Coordinates (`Coordinates`) of the knots of a monotone curve: logarithms of the differences of neighbours.
+    """Coordinates (`Coordinates`) of a monotone curve: logarithms of the differences between neighbouring knots.
 
-    The curve is fixed at the knots ``held``, among them the first and the last. Between two of these, the differences
-    are scaled so that they add up.
+    The values at the knots ``held`` are fixed, among them the first and the last knot. The differences between two
+    consecutive fixed knots are scaled so that they add up to the difference of the fixed values.
     """
 
     uniform = False
@@ -59,7 +59,7 @@ class Increments:
         rises, found = np.diff(values.astype(np.float64)), np.zeros(len(values) - 1)
         for (a, b), (low, high) in self._spans():
             above = np.cumsum(by_values[a + 1 : b][::-1].astype(np.float64))[::-1]
-            slope = np.append(above, 0.0)  # derivative with respect to each difference of this span
+            slope = np.append(above, 0.0)  # derivative with respect to each difference between two fixed knots
             found[a:b] = rises[a:b] * (slope - (rises[a:b] * slope).sum() / (high - low))
         return found.astype(np.float32)
 
@@ -70,7 +70,7 @@ class Increments:
 
 
 def start(segments: int | None) -> Array:
-    """Return the response of an sRGB camera: the knots of a curve, or an exponent of 1 if ``segments`` is None."""
+    """Return g of an sRGB camera, the identity: the knots of a curve, or an exponent of 1 if ``segments`` is None."""
     return np.ones(1, np.float32) if segments is None else np.linspace(0, 1, segments + 1, dtype=np.float32)
 
 
@@ -81,13 +81,16 @@ def coordinates(values: Array, fix_exponent: bool) -> Increments:
 
 
 def decoded(image: Image) -> Image:
-    """Decode sRGB values in [0, 1] to linear ones. The inverse of `encoded`."""
+    """Decode sRGB values in [0, 1] to linear values. This function is the inverse of `encoded`."""
     low = image / 12.92
     return np.where(image <= 0.04045, low, ((np.maximum(image, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def linearized(values: Mapping[str, Array], target: Image) -> Image:
-    """Apply g to the colours of a target; values above 1 of a curve stay. The target itself without a response."""
+    """Apply g to the colours of a target. A curve does not change colours above 1.
+
+    Returns the target itself if ``values`` contain no response.
+    """
     if RESPONSE not in values:
         return target
     curve, colours, rest = values[RESPONSE], *_split(target)

@@ -267,7 +267,7 @@ def build_problem(
     baseline = None if config.baseline is None else _gradient_integrator(config.baseline)
     if baseline is not None:
         keys_of(params, config.parameters, config.derived, baseline)
-        _edges(params, keys, baseline)  # keeps the baseline from logging its own note; the result is not needed
+        _edges(params, keys, baseline)  # only suppresses the note that the baseline would log
     judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     # Cheap checks come before the rendering of targets.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)

@@ -1,4 +1,7 @@
-"""`from_photos` writes a job that recovers a scene from photographs: poses and lens, region, start, stages."""
+"""`from_photos` writes a job that recovers a scene from photographs.
+
+It resamples the photographs to pinhole cameras, and chooses the region of the scene, initial values and stages.
+"""
 
 from __future__ import annotations
 
@@ -145,7 +148,7 @@ class _Summary:
 
     @property
     def mean(self) -> np.ndarray:
-        """Mean colour, at least a hundredth."""
+        """Mean colour of the images, with components of at least 0.01."""
         return np.maximum(self._sum / self._count, 0.01)
 
 
@@ -175,7 +178,7 @@ def _write_start(folder: Path, region: Box, mean: np.ndarray, proxy: Proxy | Non
 
 
 def measure(scene: Path, frames: Sequence[Frame], near: float) -> Speed:
-    """Measure how fast this machine renders a scene from one of the cameras: tracing, compiling, and samples."""
+    """Measure the seconds to trace and to compile an image of a scene, and the samples per second, on this machine."""
     frame, loaded = frames[len(frames) // 2], load_scene(scene)
 
     def seconds(sensor: mi.Sensor, spp: int, seed: int) -> float:

@@ -66,7 +66,7 @@ def field_scene(box: Box, has_sky: bool) -> str:
 def mesh_scene(file: str, kind: str, texture: bool) -> str:
     """Return the scene of a given mesh with a recovered reflectance, under a recovered sky.
 
-    ``texture`` selects a bitmap by texture coordinates; otherwise, the reflectance is a colour per vertex.
+    The reflectance is a bitmap if ``texture`` is True, and a colour per vertex otherwise.
     """
     reflectance = (
         '      <texture type="bitmap" name="reflectance">\n'
@@ -100,7 +100,7 @@ def _xyz(values: Iterable[float]) -> str:
 
 
 def job_text(source: str, plan: Plan, choices: Choices, test_every: int, mesh_key: str | None = None) -> str:
-    """Return the job: ``mesh_key`` is the reflectance of a given mesh, or None for a density grid."""
+    """Return the text of a job. ``mesh_key`` is the key of a given mesh's reflectance, or None for a density grid."""
     tables = [_head(source, choices.near_clip, plan, test_every, mesh_key is None), _EXPOSURE]
     tables += _field(plan, choices.brightest) if mesh_key is None else [_colour(mesh_key)]
     if choices.has_sky:
@@ -117,7 +117,10 @@ def job_text(source: str, plan: Plan, choices: Choices, test_every: int, mesh_ke
 
 
 def _moving(first: bool, choices: Choices, mesh_key: str | None) -> list[str]:
-    """Return the parameters of a stage, or an empty list for all: the first stage holds exposures and poses."""
+    """Return the parameters that a stage optimises, or an empty list for all parameters.
+
+    The ``first`` stage does not optimise exposures and poses.
+    """
     if not first:
         return []
     return [*([DENSITY, RADIANCE] if mesh_key is None else [mesh_key]), *([SKY] if choices.has_sky else [])]

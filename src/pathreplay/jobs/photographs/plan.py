@@ -34,7 +34,7 @@ USED = 0.75
 
 @dataclass(frozen=True)
 class StagePlan:
-    """A stage: iterations, reduction of the images, resolution of grids, factor on learning rates."""
+    """A stage: iterations, reduction of the images, resolution of grids, views per iteration, samples per pixel."""
 
     iterations: int
     downscale: int
@@ -68,7 +68,8 @@ class Speed:
 def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: int, name: str) -> Plan:
     """Choose the stages that fit into a time limit.
 
-    A stage with less than `LEAST` iterations is left out, and its time goes to the others; the first stage stays.
+    While the last stage has less than `LEAST` iterations, it is left out, and the other stages share its time. The
+    first stage is never left out.
 
     Args:
         speed: speed of the machine.

@@ -42,7 +42,8 @@ def find_region(frames: Sequence[Frame]) -> Box:
     """Find the region of a capture.
 
     The point closest to the optical axes of all cameras is the centre of a cube, whose size follows from the distances
-    of the cameras. The region is the bounding box of the cells of this cube that `SEEN_BY` of the cameras see.
+    of the cameras to this point. The cube is divided into cells. The region is the bounding box of all cells that at
+    least the fraction `SEEN_BY` of the cameras see.
 
     Raises:
         PathreplayError: the cameras have the same position, or no part of the cube is seen by enough of them.
@@ -68,7 +69,10 @@ def find_region(frames: Sequence[Frame]) -> Box:
 
 
 def near_clip(frames: Sequence[Frame]) -> float:
-    """Return a near clipping distance. Without it, fog in front of each camera would explain its photograph."""
+    """Return a near clipping distance.
+
+    Without near clipping, fog directly in front of a camera could reproduce the photograph of this camera.
+    """
     places = np.array([frame.place for frame in frames])
     return NEAR * float(np.linalg.norm(places[:, :3, 3] - _focus(places), axis=1).min())
 
@@ -76,7 +80,8 @@ def near_clip(frames: Sequence[Frame]) -> float:
 def _focus(places: np.ndarray) -> np.ndarray:
     """Return the point with the least sum of squared distances from the optical axes.
 
-    Almost parallel axes determine no such point; a weak spring to the cameras' positions keeps the result finite.
+    Almost parallel axes determine no such point. A small multiple of the squared distances from the cameras' positions
+    is therefore added to the sum, which keeps the result finite.
     """
     positions, axes = places[:, :3, 3], -places[:, :3, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
