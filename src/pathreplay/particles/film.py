@@ -1,12 +1,12 @@
 """The film of light paths: contributions at arbitrary positions, spread by the reconstruction filter.
 
-The pixel at x has the value Σ h(x - s) c / ∫h, with h the filter, s the film position of a contribution, and c its
-value. The sum is differentiable in c and s. Mitsuba's `ImageBlock` divides by the sum of h over the pixels around s
-instead, and omits the derivative of this sum.
+Let h be the filter, s the film position of a contribution, and c the value of the contribution. The pixel at x is the
+sum of h(x - s) c / ∫h over all contributions, multiplied by the number of pixels and divided by the number of light
+paths. The sum is differentiable in c and s. Mitsuba's `ImageBlock` does not divide by ∫h, but by the sum of h over the
+pixels around s, and omits the derivative of this divisor.
 
 Contributions from up to one filter radius outside of the film are added as well. A contribution that moves across the
-border of the film then changes the image continuously. The image is the same as with ``sample_border = true`` for
-camera paths.
+border of the film then changes the image continuously. Camera paths give the same image if ``sample_border`` is true.
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ STEPS = 4096  # number of steps of the midpoint rule for the integral of the fil
 
 @dataclass
 class Footprint:
-    """The n x n pixels that a contribution reaches: their lowest corner, and the filter's values along both axes."""
+    """The pixels that a contribution reaches: a square with n pixels along each side (see `ParticleFilm`).
+
+    ``corner`` is the pixel with the smallest coordinates. ``x`` and ``y`` are the values of the filter along the axes.
+    """
 
     corner: mi.Point2i
     x: list[mi.Float]
@@ -35,7 +38,7 @@ class Footprint:
 
 @dataclass(frozen=True)
 class ParticleFilm:
-    """The film of a sensor. Buffers have four numbers per pixel: red, green, blue, and zero."""
+    """The film of a sensor. Its methods use buffers with four numbers per pixel: red, green, blue, and zero."""
 
     film: mi.Film
     width: int
@@ -82,7 +85,10 @@ class ParticleFilm:
     def add(
         self, sums: mi.Float, at: Footprint, x: list[mi.Float], y: list[mi.Float], c: mi.Color3f, ok: mi.Bool
     ) -> None:
-        """Add the colour ``c`` to the pixels of a footprint, weighted by ``x`` and ``y`` along the axes."""
+        """Add the colour ``c`` to the pixels of the footprint ``at`` in the buffer ``sums``, where ``ok`` is set.
+
+        The weight of a pixel is the product of an entry of ``x`` and an entry of ``y``.
+        """
         for column in range(self.n):
             for row in range(self.n):
                 index, inside = self._pixel(at, column, row)
@@ -90,7 +96,7 @@ class ParticleFilm:
                 dr.scatter_add(sums, mi.Vector4f(value.x, value.y, value.z, 0), index, ok & inside)
 
     def gather(self, buffer: mi.Float, s: mi.Point2f, active: mi.Bool) -> mi.Color3f:
-        """Return Σ h(x - s) A(x) over the pixels x, with A the ``buffer``; differentiable in s."""
+        """Return Σ h(x - s) A(x) over the pixels x, with A the ``buffer``. The sum is differentiable in s."""
         at, total = self.footprint(s), mi.Color3f(0)
         for column in range(self.n):
             for row in range(self.n):
@@ -123,7 +129,7 @@ class ParticleFilm:
         return self.film.develop()
 
     def adjoint(self, grad_in: mi.TensorXf) -> mi.Float:
-        """Back-propagate the adjoint of an image to a buffer."""
+        """Back-propagate the adjoint ``grad_in`` of an image through `develop`; return the adjoint of the buffer."""
         with dr.resume_grad():
             sums = dr.zeros(mi.Float, 4 * self.pixels)
             dr.enable_grad(sums)
@@ -137,8 +143,8 @@ class ParticleFilm:
         return buffer
 
 
-# Integrals of filters along one axis, by the string representation of the filter. A pass recorded by `dr.freeze` cannot
-# compute them.
+# Cache of the integrals of filters along one axis. The keys are the string representations of the filters. A pass that
+# `dr.freeze` records cannot compute the integrals.
 _LENGTHS: dict[str, float] = {}
 
 
@@ -149,14 +155,14 @@ def _length(filter: mi.ReconstructionFilter) -> float:
 
 
 def colour(c: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.Color3f:
-    """Convert a radiance to the colour that films store, as Mitsuba does. Linear in the radiance."""
+    """Convert a radiance to the colour that films store, as Mitsuba does. The conversion is linear."""
     if mi.is_spectral:
         return mi.spectrum_to_srgb(c, wavelengths)  # type: ignore[attr-defined, no-any-return]  # spectral variants only
     return mi.Color3f(c.x) if mi.is_monochromatic else mi.Color3f(c)
 
 
 def colour_adjoint(A: mi.Color3f, wavelengths: mi.Spectrum) -> mi.Spectrum:
-    """Apply the transpose of `colour`."""
+    """Apply the transpose of the linear map `colour`."""
     if mi.is_spectral:
         result = mi.Spectrum(0)
         for k in range(len(result)):

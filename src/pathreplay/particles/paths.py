@@ -1,10 +1,12 @@
-"""Loops over light paths: the image, its tangent, and the sweep that back-propagates its adjoint.
+"""Loops over light paths. They render the image, compute its tangent, and back-propagate the adjoint of the image.
 
 Each lane traces many light paths one after the other. Memory therefore does not depend on the number of light paths.
-The radiance throughput of a path is W_0 β, with W_0 the weight of its first ray. Vertex i contributes W_0 β_i c_i to
-the image at film position s_i (see `Splat`). The weight of the continuation of the path is w_i. Let A(s) be the adjoint
-of the image as a fixed function of film position. The derivative of a loss is then the derivative of Σ W_0 L_0, summed
-over all paths, with
+
+Let W_0 be the weight of the first ray of a path, and w_i the weight with which the path continues at vertex i. The
+throughput at vertex i is W_0 β_i, where β_i is the product of the weights w at the vertices before i. Vertex i adds the
+value W_0 β_i c_i to the image, at the film position s_i (see `Splat`). Let A be the adjoint of the image, interpolated
+by the filter (see `ParticleFilm.gather`). The function A is fixed, but its argument s_i is differentiated. The
+derivative of the loss is then the derivative of the sum of W_0 L_0 over all paths, with
 
     L_i = A(s_i) c_i + w_i L_{i+1}.
 """
@@ -95,9 +97,10 @@ def particle_image(trace: TraceConfig, particles: Particles, film: ParticleFilm)
 def particle_tangent(
     trace: TraceConfig, particles: Particles, film: ParticleFilm, lost: NonFiniteCounter
 ) -> tuple[mi.TensorXf, bool]:
-    """Compute the tangent of the image from the tangents of the parameters, and return whether paths move.
+    """Compute the tangent of the image from the tangents of the parameters.
 
-    ``lost`` counts the paths whose tangent was not finite and was dropped.
+    Returns the tangent, and whether light paths move with the parameters. ``lost`` counts the paths whose tangent was
+    not finite and was dropped.
     """
     sums = dr.zeros(mi.Float, 4 * film.pixels)
     i = dr.arange(mi.UInt32, particles.lanes)
@@ -139,10 +142,11 @@ def particle_tangent(
 def particle_sweep(
     trace: TraceConfig, particles: Particles, film: ParticleFilm, grad_in: mi.TensorXf, lost: NonFiniteCounter
 ) -> bool:
-    """Back-propagate the adjoint of the image into the parameters; return whether paths move with the parameters.
+    """Back-propagate the adjoint ``grad_in`` of the image into the parameters.
 
-    Each path is recorded and swept back as in `sweep`. Not differentiated: visibility and, with ``attach='none'``, all
-    motion.
+    Returns whether light paths move with the parameters. Each path is recorded, and its vertices are differentiated
+    from the last to the first, as in `sweep`. Visibility is not differentiated. With ``attach='none'``, motion is not
+    differentiated either. ``lost`` counts the paths whose gradient is incomplete.
 
     Raises PathreplayError if ``max_depth`` exceeds `deepest`, or if the paths depend on no parameter with gradients.
     """
@@ -199,7 +203,7 @@ def particle_sweep(
 
 
 def link_of(trace: TraceConfig, sensor: mi.Sensor, caustics: bool) -> TraceConfig:
-    """Return the configuration of light paths to a sensor.
+    """Return the configuration with which light paths to a sensor are traced.
 
     A light path of ``max_depth`` segments has ``max_depth`` - 1 vertices, because neither emitter nor sensor counts as
     a vertex. With ``caustics``, only the paths that `TraceConfig.without_caustics` omits are traced.

@@ -31,8 +31,9 @@ EMITTERS = frozenset(
 )
 MAP = "EnvironmentMapEmitter"
 
-# Largest distance between the origin of a ray and the triangle that emitted it, in units of Mitsuba's offset of origins
-# along normals. Only rays nearly parallel to the triangle have a larger distance, and these carry almost no flux.
+# Largest accepted distance between the origin of a ray and the triangle that emitted the ray. The unit is the distance
+# by which Mitsuba offsets origins along the normal. Only rays nearly parallel to the triangle have a larger distance.
+# These rays carry almost no flux, and are rejected.
 CLOSE = 100
 
 
@@ -41,7 +42,7 @@ class EmitterSamples:
     """The random numbers of the first ray."""
 
     time: mi.Float
-    emitter: mi.Float  # choice of the emitter, reused for the wavelengths
+    emitter: mi.Float  # selects the emitter, and then the wavelengths
     place: mi.Point2f
     direction: mi.Point2f
 
@@ -56,8 +57,8 @@ class Emission:
     """The emitters of a scene, and the probabilities with which light paths start at them."""
 
     scene: mi.Scene
-    sensor: mi.Sensor  # provides the time
-    weights: tuple[float, ...]  # relative probabilities of starting at an emitter
+    sensor: mi.Sensor  # its shutter determines the time of the rays
+    weights: tuple[float, ...]  # relative probability of starting a path, for each emitter
     maps: tuple[mi.Emitter, ...]  # environment maps
     rounded: tuple[mi.Emitter, ...]  # emissive meshes with interpolated normals
 
@@ -100,17 +101,18 @@ class Emission:
         return index, (u - low) / (high - low), high - low
 
     def emit(self, trace: TraceConfig, u: EmitterSamples, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Sample a ray and its weight: emitted radiance times cosine, over density. Differentiable in the emitters.
+        """Sample a ray, and compute its weight. Both are differentiable in the parameters of the emitters.
 
-        The point has fixed coordinates on the emitter, and the direction has fixed coordinates in the local frame. Both
-        move with the emitter.
+        The weight is the emitted radiance times the cosine at the emitter, divided by the sampling density. The origin
+        of the ray has fixed coordinates on the emitter, and its direction has fixed coordinates in the local frame.
+        Origin and direction therefore move with the emitter.
         """
         index, again, probability = self.pick(u.emitter)
         emitter = dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index, active)
         time = mi.Float(self.sensor.shutter_open()) + u.time * self.sensor.shutter_open_time()
         ray, weight = emitter.sample_ray(time, again, u.place, u.direction, active)
         if self.maps:
-            # Mitsuba 3.9 does not rotate the disk of starting points with the map.
+            # Mitsuba 3.9 does not rotate the disk of origins with the environment map. Compute the origin again.
             box = self.scene.bbox()
             radius = 0.5 * math.sqrt(sum(float(x) ** 2 for x in box.extents()))
             disk = mi.warp.square_to_uniform_disk_concentric(u.place)
@@ -147,7 +149,10 @@ def _has_smooth_mesh(emitter: mi.Emitter) -> bool:
 def _origin(
     trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f, mi.Bool]:
-    """Find the triangle that emitted a ray. Returns a hit, the ray to it, and whether a mesh was found."""
+    """Find the triangle that emitted a ray, by tracing the reversed ray from the same origin.
+
+    Returns the hit of the reversed ray, the reversed ray, and whether the hit is on a mesh with this emitter.
+    """
     back = mi.Ray3f(dr.detach(ray))
     back.d = -back.d
     hit = trace.scene.ray_intersect_preliminary(back, active=active)
@@ -155,7 +160,10 @@ def _origin(
 
 
 def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-    """Return a factor of value 1, with the derivative of the log area of the emitting triangle. Mitsuba omits it."""
+    """Return a factor of value 1, whose derivative is that of the logarithm of the emitting triangle's area.
+
+    Mitsuba's `sample_ray` omits this derivative.
+    """
     hit, back, on_mesh = _origin(trace, emitter, ray, active)
     area = dr.norm(surface_point(hit, back, on_mesh).A)
     return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)

@@ -28,15 +28,15 @@ POSITIONS = "vertex_positions", "positions"
 NORMALS = "vertex_normals", "normals"
 TEXCOORDS = "vertex_texcoords", "texcoords"
 _FACES = "faces"
-_SHADING = "Default"  # the flag of 3.10
-_FROM_FIELDS = "from_fields"  # the method of 3.10 that fills a mesh
+_SHADING = "Default"  # a flag that only 3.10 has
+_FROM_FIELDS = "from_fields"  # a method that only 3.10 has, and that fills a mesh
 _PREFIXES = "vertex_", "face_"
 _SPACE = 64  # number of entries that are allocated after the values of an array
 _OTHERS = _FACES, "bsdf_index", "position_index", "normal_index"
 
 
 class _Detail(NamedTuple):
-    """Values of flags."""
+    """Values of the flags of `compute_surface_interaction`, by the names of the functions below."""
 
     minimal: int
     shading_frame: int
@@ -47,7 +47,7 @@ class _Detail(NamedTuple):
 
 @cache
 def _detail(flags: type[enum.Enum]) -> _Detail:
-    """Return the values of the flags from the enumeration ``flags``."""
+    """Return the values of the flags. ``flags`` is the enumeration `mi.RayFlags` of the active variant."""
     value = {name: int(flag.value) for name, flag in flags.__members__.items()}
     minimal, follow = value["Minimal"], value["FollowShape"]
     if _SHADING in value:
@@ -63,20 +63,20 @@ def minimal() -> int:
 
 
 def shading_frame() -> int:
-    """Flags of an interaction that also has a shading frame."""
+    """Flags of an interaction with the fields of `minimal` and a shading frame."""
     return _detail(mi.RayFlags).shading_frame
 
 
 def shading() -> int:
-    """Flags of an interaction that also has texture coordinates, tangents and the incident direction."""
+    """Flags of an interaction with the fields of `shading_frame`, texture coordinates, tangents and `wi`."""
     return _detail(mi.RayFlags).shading
 
 
 def normal_partials() -> int:
-    """Flags of an interaction that also has derivatives of the normal.
+    """Flags of an interaction with the fields of `shading` and derivatives of the normal.
 
-    These are derivatives of the geometric normal in 3.9, and of the shading normal in 3.10. On shapes other than
-    meshes, both are equal.
+    The derivatives are those of the geometric normal in 3.9, and those of the shading normal in 3.10. On shapes other
+    than meshes, the two normals are equal.
     """
     return _detail(mi.RayFlags).normal_partials
 
@@ -151,7 +151,10 @@ def _rows(params: Mapping[str, object], names: tuple[str, str], width: int) -> N
 def _index(
     params: Mapping[str, object], name: str, count: int, otherwise: NDArray[np.integer] | None = None
 ) -> NDArray[np.integer]:
-    """Return an index map. An empty or missing map is ``otherwise``, by default the identity."""
+    """Return the index map ``name``. If the map is empty or missing, return ``otherwise`` instead.
+
+    The default of ``otherwise`` is the identity map with ``count`` entries.
+    """
     index = np.array(params[name]).ravel() if name in params else np.zeros(0, int)
     if len(index):
         return index

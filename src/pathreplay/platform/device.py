@@ -5,8 +5,8 @@ stack. A GPU reserves local memory for every thread that can be resident, whatev
 vertex records of 124 bytes per thread, for 2048 threads on each of 132 multiprocessors, take 69 GB. Long paths are
 therefore recorded only on CPUs.
 
-The figures for GPUs were measured on an H100 (docs/memory.md) and are tested with simulated devices. `pathreplay doctor
---gpu` measures them on other GPUs.
+The limits for GPUs were measured on an H100 (docs/memory.md). Tests check the limits with simulated devices. On other
+GPUs, `pathreplay doctor --gpu` measures the limits.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ class Device:
         return not self.is_gpu
 
     def local_bytes(self) -> int | None:
-        """Return the bytes of local memory that a lane may use; None on CPUs, where only the caller's limits apply."""
+        """Return the bytes of local memory that a lane may use; None on CPUs, which have no such limit."""
         if not self.is_gpu:
             return None
         known = self.lanes > 0 and self.memory > 0
         return min(LARGEST_LOCAL, int(SHARE * self.memory) // self.lanes) if known else LARGEST_LOCAL
 
     def most_records(self, size: int, otherwise: int) -> int:
-        """Return how many records of ``size`` bytes a lane can store in its local memory, at most ``otherwise``."""
+        """Return how many records of ``size`` bytes fit into the local memory of a lane, at most ``otherwise``."""
         room = self.local_bytes()
         return otherwise if room is None else min(otherwise, room // size)
 

@@ -24,7 +24,8 @@ _KINDS = {
 def file_problem(path: str | Path, most_bytes: int | None = None) -> str:
     """Return why ``path`` cannot be read as a file, as the predicate of an error message, or "".
 
-    Symbolic links are followed. A file of more than ``most_bytes`` is too large to be of the expected kind.
+    Symbolic links are followed. A file of more than ``most_bytes`` counts as unreadable, because no valid file of the
+    expected kind is that large.
     """
     try:
         status = os.stat(path)
@@ -41,7 +42,8 @@ def file_problem(path: str | Path, most_bytes: int | None = None) -> str:
     return ""
 
 
-# Bytes in a file name. File systems allow 255; the rest is for a prefix, a suffix, and the mark of an unfinished file.
+# Largest number of bytes of a file name. File systems allow 255 bytes. The difference is reserved for a prefix, a
+# suffix, and the mark of an unfinished file.
 LONGEST = 150
 
 
@@ -49,7 +51,7 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
     """Return a file name (without suffix) for each name; the file names differ even if case is ignored.
 
     Letters, digits, ``_``, ``.`` and ``-`` stay; other characters become ``_``. Long names are truncated. A short hash
-    of the name is appended to a file name that was truncated or would collide with another.
+    of the name is appended to a file name that was truncated or would collide with another file name.
     """
     safe = {name: re.sub(r"[^\w.-]", "_", name) for name in names}
     # Some file systems ignore case, hence casefold.

@@ -14,14 +14,18 @@ from pathreplay.errors import PathreplayError
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Seconds. Signals within this interval count as one: a second signal must not interrupt the reaction to the first.
+# Interval in seconds within which several signals count as one, so that a second signal does not interrupt the reaction
+# to the first signal.
 ONE_WISH_S = 1.0
 
 _raised_at: list[float] = []  # time at which a signal handler last raised an exception
 
 
 def raise_once(error: BaseException) -> None:
-    """Raise ``error`` unless this function has raised an exception within `ONE_WISH_S`, which may still propagate."""
+    """Raise ``error``, unless this function raised an exception less than `ONE_WISH_S` seconds ago.
+
+    The earlier exception may still propagate.
+    """
     now = time.monotonic()
     if _raised_at and now - _raised_at[-1] < ONE_WISH_S:
         return

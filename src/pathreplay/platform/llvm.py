@@ -128,7 +128,7 @@ def system_libraries() -> list[str]:
 def candidates() -> Iterator[tuple[str, str]]:
     """Yield (path, origin) of each libLLVM to test, in order of preference, each file once."""
     pip = pip_library() or ""
-    # In a subprocess, the variable may name the wheel's library because the parent has set it. The origin is still pip.
+    # The parent process may have set the variable to the path of the wheel's library. The origin is then still pip.
     named = ((ASKED_FOR, "pip" if ASKED_FOR == pip else ENVIRONMENT_VARIABLE), (pip, "pip"))
     seen = {""}
     for path, origin in (*named, *((path, "system") for path in system_libraries())):
@@ -138,7 +138,8 @@ def candidates() -> Iterator[tuple[str, str]]:
             yield path, origin
 
 
-#: Start of every test: set the parent's sys.path, disable core dumps (a crash is a valid result), load libraries.
+#: First lines of the code of every test. They set the parent's sys.path, disable core dumps (because a crash is a valid
+#: result), and load libraries.
 _BEGIN = """
 import ctypes, json, sys
 task = json.loads(sys.argv[1])

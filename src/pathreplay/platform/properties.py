@@ -15,7 +15,7 @@ class Property(Generic[T]):
     Args:
         name: name of the property in XML and in dictionaries.
         kind: type of the value, such as ``integer`` or ``texture``.
-        default: default value; None if the property has none, or if its meaning states the default.
+        default: default value. None means that the property has no default, or that ``meaning`` states the default.
         meaning: what the property selects, as statements in Markdown.
         choices: all valid values, if there are few.
         see: page and heading below ``docs/`` that say more.

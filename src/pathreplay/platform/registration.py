@@ -51,8 +51,8 @@ def register(variant: str, plugins: Plugins = PLUGINS) -> None:
 
 def mitsuba_integrator() -> Any:
     """Return Mitsuba's ADIntegrator of the active variant, whose `prepare` seeds the sampler of each pass."""
-    # Mitsuba executes this module again for every variant. An import from the public `mitsuba.ad` would create a copy
-    # that stays bound to the first variant.
+    # Mitsuba executes the module `common` again for every variant. An import from the public `mitsuba.ad` would create
+    # a copy of `common` that stays bound to the first variant.
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
     return ADIntegrator
@@ -61,8 +61,9 @@ def mitsuba_integrator() -> Any:
 def on_base(template: type, base: type) -> type:
     """Build a class that has the attributes of a template and inherits from a base class of Mitsuba.
 
-    Each variant has its own base class. A template is defined before Mitsuba has a variant, and cannot inherit from a
-    base class. Its methods call base methods by the name of the class, such as ``mi.BSDF.__init__(self, props)``.
+    Each variant of Mitsuba has its own base classes. A template is defined before a variant is set, and therefore
+    cannot inherit from a base class. The methods of a template call the methods of the base class by the name of the
+    base class, for example ``mi.BSDF.__init__(self, props)``.
     """
     parts = [vars(part) for part in reversed(template.__mro__[:-1])]
     body = {name: value for part in parts for name, value in part.items() if name not in ("__dict__", "__weakref__")}

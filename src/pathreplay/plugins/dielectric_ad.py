@@ -160,7 +160,7 @@ class DielectricAD:
         if self.specular_transmittance is not None:
             tinted[selected_t] = tinted * self.specular_transmittance.eval(si, selected_t)
         if ctx.mode == mi.TransportMode.Radiance:
-            # Refraction scales solid angles by η_ti², and radiance accordingly.
+            # Refraction changes the solid angle of a beam. The transmitted radiance is therefore scaled by η_ti².
             tinted[selected_t] = tinted * dr.square(η_ti)
         return bs, dr.select(active, tinted, 0)
 

@@ -1,8 +1,9 @@
 """Cell-by-cell ray traversal: free flight with local majorants, transmittance with local control densities.
 
 The state of the traversal (Amanatides and Woo 1987) is the cell and the distance. The distance to the next cell face of
-axis k is computed from the cell, as t_k = (cell_k + [d_k > 0] - o_k) / d_k. It is not accumulated, so that rounding
-errors do not grow. Every step leaves a cell and never returns to it, which bounds the number of steps.
+axis k is computed from the cell, as t_k = (cell_k + [d_k > 0] - o_k) / d_k. The distance is not a sum of earlier steps,
+so that rounding errors do not grow. The traversal never returns to a cell that it has left, which bounds the number of
+steps.
 
 Callers detach all inputs, except those of `through`. All functions can be used inside symbolic loops.
 """
@@ -22,16 +23,17 @@ from pathreplay.plugins.supergrid import Bounds
 
 T = TypeVar("T")
 
-#: Rate m of residual collisions, in units of the largest residual density. The variance is exp(x) - 1, where x is
-#: inversely proportional to m (see `control`). With a value of 4 instead of 2, the additional collisions take more time
-#: than the lower noise saves (`pathreplay bench gridmedium`).
+#: The rate m of residual collisions is DENSER times the largest |σ - c| in a cell. A larger value of DENSER lowers the
+#: variance of the transmittance (see `control`), but adds collisions, which take time. At equal time, the noise is
+#: higher with the value 4 than with the value 2 (`pathreplay bench gridmedium`).
 DENSER = 2.0
-#: Largest value of ∫ (σ - c)²/m ds over one cell, if σ is the lowest density of the cell along the whole ray. This
-#: integral approximates the relative variance that the cell adds to the transmittance (see `control`). A ray crosses 10
-#: to 50 cells. With the mean as control density in all cells, dense grids with sharp edges produce extreme outliers.
+#: Limit of ∫ (σ - c)²/m ds over one cell, for a ray on which σ is always the lowest density of the cell. The integral
+#: approximates the relative variance that the cell adds to the transmittance (see `control`). A ray crosses 10 to 50
+#: cells. Without the limit, the control density c would be the mean density of each cell, and the transmittance of
+#: dense grids with sharp edges would have extreme outliers.
 RISK = 0.1
-#: Russian roulette is applied to transmittance estimates below this value. It adds a variance of at most FAINT times
-#: the transmittance.
+#: Russian roulette is applied to transmittance estimates below this value. Russian roulette adds a variance of at most
+#: FAINT times the transmittance.
 FAINT = 1e-2
 
 
@@ -79,10 +81,11 @@ def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
 
 
 def through(box: mi.ScalarBoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
-    """Return the distances at which the line of a ray enters and leaves a box; on a miss, the first is larger.
+    """Return the distances at which the line of a ray enters and leaves a box.
 
-    Differentiable in the ray. Mitsuba's `BoundingBox.ray_intersect` computes the same distances, but accepts only rays
-    of the first variant that was set in the process.
+    If the line misses the box, the first distance is larger than the second. The distances are differentiable in the
+    ray. Mitsuba's `BoundingBox.ray_intersect` computes the same distances, but accepts only rays of the first variant
+    that was set in the process.
     """
     near, far = mi.Float(-dr.inf), mi.Float(dr.inf)
     for k in range(3):
@@ -107,7 +110,7 @@ def clip(box: mi.ScalarBoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float
 
 @dataclass(frozen=True)
 class CellWalk:
-    """A ray in cell space. It leaves cell (i, j, k) along axis x at the distance i · inverse_x + offset_x."""
+    """A ray in cell space. The ray leaves cell (i, j, k) along axis x at the distance i · inverse_x + offset_x."""
 
     inverse: mi.Vector3f  # 1/d; 0 for axes perpendicular to the ray
     offset: mi.Vector3f  # ([d > 0] - o)/d; infinite for axes perpendicular to the ray
@@ -194,11 +197,12 @@ def free_flight(
 
 
 def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Compute control density c and residual collision rate m per cell, for density σ = ``scale`` times the volume.
+    """Compute the control density c and the rate m of residual collisions per cell.
 
-    The relative variance of the transmittance is exp(∫ (σ - c)²/m ds) - 1. The mean density as c minimizes the integral
-    on average. However, if a ray passes only through the lowest density of a cell, the integral over this cell can be
-    large. The value of c is therefore limited, so that the integral over one cell does not exceed RISK for such a ray.
+    The density σ is ``scale`` times the volume. The relative variance of the transmittance is exp(∫ (σ - c)²/m ds) - 1.
+    On average, the integral is smallest if c is the mean density of the cell. However, the integral over a cell can be
+    large for a ray on which σ is always the lowest density of the cell. Therefore, c is limited, so that the integral
+    does not exceed RISK on such a ray. The limit is computed for twice the mean length of a ray in a cell.
     """
     lowest, highest = _scaled(bounds, scale)
     length = 2 / bounds.faces_per_length  # twice the mean length of a ray in a cell
@@ -229,7 +233,7 @@ def transmittance(
     """Estimate exp(-∫ σ ds) along the ray per channel (UnpolarizedSpectrum) without bias: residual ratio tracking.
 
     The estimate is T = exp(-∫ c ds) Π (1 - (σ - c)/m), with control density c and rate m per cell (Novák et al. 2014).
-    The product is over residual collisions, which have the rate m. ``density(t, active)`` evaluates σ.
+    The product is over the residual collisions, which are sampled with the rate m. ``density(t, active)`` evaluates σ.
     """
     a, b = clip(box, ray)
     trace = begin(cells, ray, a, b)

@@ -135,8 +135,9 @@ class GridMedium:
     def _choose_cells(self) -> None:
         """Build tables of majorants and control densities for the current scale, each with the cheapest cell size."""
         scale = dr.detach(self.scale)
-        # Emission and the derivative of in-scattering are estimated at tentative collisions. For these estimates, empty
-        # cells also need tentative collisions: one per mean chord of the box.
+        # Emission and the derivative of in-scattering are estimated at tentative collisions. Empty cells therefore also
+        # need tentative collisions. Their majorant is the inverse of the mean chord length of the box, which gives one
+        # tentative collision on average along a ray of this length.
         with dr.resume_grad():
             params = mi.traverse(self.sigma_t)
             moves = dr.grad_enabled(self.scale) or any(dr.grad_enabled(params[key]) for key in params.keys())
@@ -149,7 +150,10 @@ class GridMedium:
         dr.make_opaque(self.majorant)
 
     def _cheapest_cells(self, values: Sequence[tuple[mi.Float, ...]]) -> grid_traversal.Cells:
-        """Return the cells of the cheapest level. ``values`` has a tuple per level, with the rate as its last entry."""
+        """Return cells with the values of the cheapest cell size in ``self.levels``.
+
+        ``values`` has one tuple per cell size. The last entry of a tuple contains the collision rates of the cells.
+        """
         rates = [dr.mean(numbers[-1]) for numbers in values]
         dr.eval(values, rates)
         last = len(values) - 1
@@ -257,7 +261,10 @@ def _choice(props: mi.Properties) -> bool | str:
 
 
 def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
-    """Return whether the channels of a volume may differ, and its bounds for all cell sizes, from fine to coarse."""
+    """Return whether the channels of a volume may differ, and a list of the bounds of the volume's values.
+
+    The list has one entry (see `Bounds`) per cell size, from fine to coarse.
+    """
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]
     if volume.class_name() == "GridVolume":

@@ -4,9 +4,9 @@
 return. `coarser` merges 2 x 2 x 2 cells. `cheapest` selects a cell size between BASE³ voxels and the whole volume.
 
 `gridvolume` does not expose its filter and its wrap mode. The bounds are therefore valid for both filters and all wrap
-modes. They include the voxels adjacent to a cell and, beyond the faces of the grid, the values that every wrap mode
-would return. They are also valid up to half a voxel beyond the faces of the cell, so that rounding in a traversal is
-harmless.
+modes. The bounds of a cell include the voxels adjacent to the cell. Beyond the faces of the grid, the bounds include
+the values of all wrap modes. The bounds also hold up to half a voxel beyond the faces of the cell, so that rounding in
+a traversal is harmless.
 
 Nothing here is differentiated.
 """
@@ -79,8 +79,8 @@ class Bounds:
 def find_lattice(volume: mi.Volume, shape: tuple[int, ...]) -> Lattice | None:
     """Determine the lattice of a `gridvolume` with data of shape (z, y, x, channels); return None on failure.
 
-    Mitsuba does not expose the volume's `to_world`. Its linear part is parsed from the volume's string representation,
-    and the translation comes from the bounding box, which has full precision.
+    Mitsuba does not expose the volume's `to_world`. The linear part of `to_world` is parsed from the volume's string
+    representation. The translation is computed from the bounding box, which has full precision.
     """
     row = r"\[" + ", ".join([r"([-+.\de]+)"] * 4) + r"\]"
     printed = re.search(r"to_local = Transform\[\s*matrix=\[" + r",\s*".join([row] * 3), repr(volume))
@@ -101,8 +101,8 @@ def find_lattice(volume: mi.Volume, shape: tuple[int, ...]) -> Lattice | None:
     to_voxel = np.concatenate([to_local, -(to_local @ corner)[:, None]], axis=1) * np.array(size)[:, None]
     corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1)
     reached = to_voxel[:, :3] @ corners + to_voxel[:, 3:]
-    # Differences of a hundredth of a voxel are rounding errors. They are harmless, because the bounds are valid up to
-    # half a voxel beyond the range.
+    # The box may extend beyond the range of voxels by up to a hundredth of a voxel, because of rounding errors. This is
+    # harmless, because the bounds are valid up to half a voxel beyond the range.
     first = np.floor(reached.min(axis=1) + 0.01).astype(int)
     last = np.ceil(reached.max(axis=1) - 0.01).astype(int)
     return Lattice(to_voxel, size, tuple(first.tolist()), tuple(np.maximum(last, first + 1).tolist()))

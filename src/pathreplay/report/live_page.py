@@ -148,7 +148,10 @@ class Previews:
         return self._frames(done, images) | self._of_views("result", "difference")
 
     def _of_views(self, *kinds: str) -> dict[str, bytes]:
-        """Encode the images of each view, and return them by file name. ``kinds`` selects images (default: all)."""
+        """Encode the images of each view, and return the encoded images by file name.
+
+        If ``kinds`` are given, only images of these kinds are encoded.
+        """
         files, shown = {}, self.pictures
         for view in shown.views:
             for kind, image in shown.now[view.name].pictures().items():
@@ -281,8 +284,9 @@ def frames(run: Path) -> Iterator[tuple[int, str, Path]]:
 def films(run: Path, most_bytes: int | None = None) -> dict[str, tuple[Still, ...]]:
     """Return the time-lapse frames of a run by subject: a view, texture or volume.
 
-    With ``most_bytes``, frames are embedded as data URIs, and thinned to about this total size. Otherwise, all
-    frames are returned, by addresses relative to the run folder.
+    With ``most_bytes``, frames are embedded as data URIs. Only every n-th frame is then returned, so that the total
+    size of the frames is about ``most_bytes``. Without ``most_bytes``, all frames are returned, with addresses relative
+    to the run folder.
     """
     stills_of: dict[str, list[tuple[int, Path]]] = {}
     for iteration, what, path in frames(run):

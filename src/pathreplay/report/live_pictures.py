@@ -35,7 +35,7 @@ CAPTIONS = {"target": "target", "result": "now", "difference": f"difference ×{D
 class LivePictures:
     """Latest images of some views of a run.
 
-    ``before`` are the images at the initial values by view name; by default, they are rendered now.
+    ``before`` contains the images at the initial values by view name. By default, the constructor renders these images.
     """
 
     def __init__(self, problem: Problem, run: Run, stop: Stop, before: Mapping[str, Image] | None = None) -> None:
@@ -61,7 +61,10 @@ class LivePictures:
         """Number of completed iterations when the latest images were rendered."""
 
     def observe(self, event: Event) -> None:
-        """Render images if they are due. `Previews` calls `is_due`, `look` and `paid` instead."""
+        """Render images if they are due.
+
+        `Previews` does not use this method, but calls `is_due`, `look` and `paid` itself.
+        """
         if isinstance(event, Stepped) and self.is_due(event.entry.seconds):
             begin = time.perf_counter()
             with self._problem.computing():
@@ -70,12 +73,12 @@ class LivePictures:
 
     def is_due(self, seconds: float) -> bool:
         """Return whether images are due after an iteration that took ``seconds``."""
-        # Before the first images are rendered, their cost is estimated by the time of an iteration, an upper bound.
+        # The time to render images is unknown before the first images. The time of an iteration is an upper bound.
         allowed = self.share * (time.perf_counter() - self._began)
         return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
 
     def paid(self, seconds: float) -> None:
-        """Record how long it took to render the latest images."""
+        """Record that rendering the latest images took ``seconds``."""
         self._cost = seconds
         self.spent += seconds
 

@@ -116,19 +116,20 @@ class Recovered:
         return {kind: value for kind in kinds if (value := getattr(self, kind)) is not None}
 
     def textures(self) -> dict[str, Image]:
-        """Return initial value, result and true value as images, downscaled by `shown`.
+        """Return initial value, result and true value as images by kind, downscaled by `shown`.
 
-        Empty unless the parameter is a texture (height, width, one to four channels).
+        The dictionary is empty unless the parameter is a texture (height, width, one to four channels).
         """
         if self.result.ndim != 3 or self.result.shape[2] > 4:
             return {}
         return {kind: shown(image) for kind, image in self.known("start", "result", "truth").items()}
 
     def volumes(self) -> dict[str, Image]:
-        """Return the middle slices of initial value, result, baseline's result and truth as images.
+        """Return the middle slices of initial value, result, baseline's result and truth as images by kind.
 
-        White is the maximum of the truth, or of the result if the truth is unknown. All images have the finest
-        resolution of these volumes. Empty unless the parameter is a volume (z, y, x, one to four channels).
+        White is the maximum of the truth, or the maximum of the result if the truth is unknown. All volumes are first
+        resampled to the resolution of the finest volume. The dictionary is empty unless the parameter is a volume (z,
+        y, x, one to four channels).
         """
         if self.result.ndim != 4 or self.result.shape[3] > 4:
             return {}
@@ -138,9 +139,9 @@ class Recovered:
         return {kind: slices(matched(volume, finest)) / white for kind, volume in given.items()}
 
     def numbers(self) -> dict[str, list[float]]:
-        """Return initial value, result and truth as numbers.
+        """Return initial value, result and truth as numbers by kind.
 
-        Empty if the parameter has more than 16 numbers or more than one dimension.
+        The dictionary is empty if the parameter has more than 16 numbers or more than one dimension.
         """
         if self.result.ndim > 1 or self.result.size > 16:
             return {}
@@ -149,7 +150,7 @@ class Recovered:
     def error(self, kind: str = "result") -> float | None:
         """Return the root mean square error of one kind of value: 'start', 'result' or 'baseline'.
 
-        None if there is no value of this kind, or if the truth is unknown.
+        The error is None if there is no value of this kind, or if the truth is unknown.
         """
         value = getattr(self, kind)
         return None if self.truth is None or value is None else rmse(value, self.truth)
@@ -175,7 +176,7 @@ class Recovered:
 
 
 def number_of(items: Iterable[Recovered]) -> int:
-    """Return the number of parameters that are not derived from others."""
+    """Return the number of parameters, without those that are computed from other parameters."""
     return sum(not item.derived for item in items)
 
 
@@ -283,7 +284,7 @@ class Outcome:
         return job, baseline if baseline != job else f"{baseline} (baseline)"
 
     def caption(self, kind: str) -> str:
-        """Return the caption of an image, texture or volume of a kind."""
+        """Return the caption of an image, texture or volume. ``kind`` is a kind such as 'start' or 'result'."""
         job, baseline = self.names()
         captions = {
             "result": "recovered" if self.run.baseline is None else f"recovered by {job}",

@@ -78,7 +78,7 @@ def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
     if not history:
         return tuple(drawn)
     errors, norms = history[-1].errors, history[-1].gradient_norms
-    for key in dict.fromkeys([*norms, *errors]):  # the errors of a pose have other keys than its norms
+    for key in dict.fromkeys([*norms, *errors]):  # the errors of a pose have other keys than its gradients
         if key in errors:
             drawn.append(plot("error of", key, error=(entry.errors.get(key) for entry in entries)))
         if key in norms:

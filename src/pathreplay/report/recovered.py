@@ -1,4 +1,7 @@
-"""Collects the parameters of a run as decoded values, each with its initial value and truth."""
+"""Collects the parameters of a run, each with its initial value, result and truth.
+
+All values are decoded values, as `scenes.stored` defines them.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,10 @@ def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
 
 
 def with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
-    """Return decoded values of variables, and of the poses and derived parameters that are computed from variables."""
+    """Return ``values``, and the values of the poses and derived parameters that are computed from ``values``.
+
+    ``values`` contains the decoded values of the variables by key.
+    """
     inputs = {name for computed in problem.made() for name in computed.of}
     if not inputs:
         return dict(values)

@@ -251,8 +251,8 @@ def loss_figure(history: Sequence[Entry]) -> Figure:
 def comparison_figure(contestants: Sequence[Contestant]) -> Figure:
     """Plot the errors of two runs against time, in one panel per error.
 
-    The panels show the error of the images, and the errors of the first `PANELS` parameters or poses. The scale is
-    logarithmic for poses.
+    The panels show the error of the images, and the errors of the first `PANELS` parameters or poses. The errors of
+    poses are drawn on a logarithmic scale, and all other errors on a linear scale.
     """
     panels = [None, *list(contestants[0].errors)[:PANELS]]
     figure = Figure(figsize=(4.4 * len(panels), 3.0), layout="constrained")
@@ -296,7 +296,7 @@ def _plain(axes: Axes, along: str) -> None:
         axes.spines[side].set_visible(False)
 
 
-# Largest number of views, and of textures and volumes, in summary.png.
+# Largest number of views in summary.png, and largest number of textures and volumes together.
 SUMMARY_ROWS = 3
 SUMMARY_SIDE = 512
 """Side in pixels to which larger images are downscaled, to save memory. Images are drawn with a width of 210 pixels."""

@@ -94,8 +94,8 @@ def outcome_of(
 ) -> Outcome:
     """Collect the outcome of a run.
 
-    ``before``, ``after`` and ``baselines`` are images by view name: at the initial values, of the result, and of the
-    baseline's result.
+    ``before`` contains the images at the initial values, ``after`` the images of the result, and ``baselines`` the
+    images of the baseline's result, each by view name.
     """
     views = tuple(
         ViewPictures(
@@ -144,7 +144,10 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Conte
 
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
-    """Return the `RunResult`. ``stopped_by`` is the source of a stop request, which a complete run ignores."""
+    """Return the `RunResult` of a run.
+
+    ``stopped_by`` names the source of a stop request, and is ignored if the run is complete.
+    """
     stopped = not outcome.complete
     return RunResult(
         folder=outcome.folder,

@@ -129,7 +129,7 @@ class RunFolder:
         lost = "unwritten data is"
         with _opened(self.path) as descriptor:
             self.require_in_place(lost, descriptor)
-            # Paths are relative to the open folder, because another folder or a link may get its name meanwhile.
+            # Paths are relative to the open folder, because something else may take the path of the folder meanwhile.
             base = self.path if descriptor is None else Path()
             try:
                 for name, content in files.items():
@@ -347,7 +347,7 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 
 
 def _make_part(output: Path, home: Path) -> Path:
-    """Create a hidden folder beside ``output``, which is renamed to ``output`` when its content is complete."""
+    """Create a hidden folder beside ``output``. `_claim` renames the hidden folder when its content is complete."""
     wanted = home / output
     part = wanted.with_name(f".{wanted.name[:100]}.{secrets.token_hex(4)}{PART}")
     try:

@@ -1,11 +1,11 @@
 """Owen-scrambled Sobol samples, stratified within each pixel and across pixels in Morton order.
 
 Each 2D sample of a path is a point of the Sobol (0,2)-sequence. The order of the points and the points themselves are
-scrambled with a separate key per dimension pair ("Practical Hash-based Owen Scrambling", Burley 2020). Different pairs
-are therefore independent, each coordinate is uniform, and every mean is unbiased. Paths are numbered pixel by pixel in
-Morton order, so that samples are also stratified over square blocks of pixels ("Screen-space blue-noise diffusion of
-Monte Carlo sampling error via hierarchical ordering of pixels", Ahmed and Wonka 2020). This lowers the noise of sums
-over pixels, such as gradients.
+scrambled with a separate key per dimension pair ("Practical Hash-based Owen Scrambling", Burley 2020). The dimension
+pairs are therefore independent of each other, each coordinate is uniform, and every mean is unbiased. Paths are
+numbered pixel by pixel in Morton order, so that samples are also stratified over square blocks of pixels ("Screen-space
+blue-noise diffusion of Monte Carlo sampling error via hierarchical ordering of pixels", Ahmed and Wonka 2020). This
+stratification lowers the noise of sums over pixels, such as gradients.
 """
 
 from __future__ import annotations

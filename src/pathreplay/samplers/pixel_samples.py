@@ -46,7 +46,7 @@ class IndependentSets:
         return self.sampler
 
     def of(self, before: Sampler, place: mi.UInt32, size: int, number: mi.UInt32) -> Sampler:
-        """See `PixelSamples`: the sampler continues its sequence."""
+        """Return ``before``, whose sequence continues with the samples of the next path."""
         return before
 
 

@@ -1,12 +1,13 @@
 """Streams: named, disjoint sequences of the counter-based samplers, one per purpose.
 
-The value of a stream is used in one of four ways, as the comments in `Stream` state:
+Each stream has an integer value. The value is used in one of five ways, as the comments in `Stream` state:
 
-- It is combined with a seed or key, by exclusive or (`Stream.of`) or by a hash.
-- It is the first index of the stream in the sequence of a key (`CounterSampler.stream`). The lowest indices, from 0 on,
-  belong to the path itself, with six samples per vertex (see `CounterSampler.at_vertex`).
-- It is added to the initial state of a generator.
-- It is hashed into the key of a Sobol sampler.
+- The exclusive or of the value and a seed or key is the seed or key of the stream (`Stream.of`).
+- A hash of the value and a seed is the seed or key of the stream.
+- The value is the first index of the stream in the sequence of a key (`CounterSampler.stream`). The lowest indices,
+  from 0 on, belong to the path itself, with six indices per vertex (see `CounterSampler.at_vertex`).
+- The value is added to the initial state of a generator.
+- The value is the index of a set of Sobol samples (`Pass.sobol_sampler`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import mitsuba as mi
 class Stream(IntEnum):
     """Purposes of random number streams."""
 
-    # Combined with the seed of a pass, by exclusive or.
+    # The exclusive or of the value and the seed of a pass is the seed of the stream.
     BOUNDARY = 0x5EED  # the boundary term; the interior term uses the seed itself
     PILOT = 0x7F4A7C15  # pilot segments, whose results determine where later segments are sampled
     CAST_SHADOWS = 0x2C1B3C6D
@@ -27,12 +28,12 @@ class Stream(IntEnum):
     SECONDARY_KEYS = 0x2545F491
     VOLUMETRIC_KEYS = 0x3C6EF372
     VOLUMETRIC_CENTRES = 0x1F83D9AB
-    # Hashed with the seed of a pass.
+    # A hash of the value and the seed of a pass is the key of the stream.
     PARTICLES = 0x68E31DA4
-    # Combined with the key of a path, by exclusive or.
+    # The exclusive or of the value and the key of a path is the key of the stream.
     EMITTER_SEGMENTS = 0x1B873593
     ARCS = 0x38B34AE5
-    # First index of the stream in the sequence of a key.
+    # The value is the first index of the stream in the sequence of a key.
     ARC = 0x100
     BEYOND_EDGE = 0x20000  # radiance that arrives from behind an edge
     BEAM = 0x30000
@@ -42,15 +43,15 @@ class Stream(IntEnum):
     TRANSMITTANCE_PAST_EDGE = 0x60000
     TRANSMITTANCE_TO_EDGE = 0x70000
     TRANSMITTANCE_OF_BEAM = 0x80000
-    # Added to the initial state of the generator that selects among the edges on a segment.
+    # The value is added to the initial state of the generator that selects one of the edges on a segment.
     BISECT_PRIMARY = 0
     BISECT_SECONDARY = 1
     BISECT_VOLUMETRIC = 2
-    # Index of an independent set of Sobol samples of a pixel (`Pass.sobol_sampler`). The interior term uses set 0. A
-    # pixel sweep uses the first `pixel_samples.SETS` sets.
-    FLOW = 0x10  # paths of the film flow
-    FLOW_MEAN = 0x11  # paths that estimate the mean radiance for the film flow
-    # Hashed with the seed of an image.
+    # The value is the index of an independent set of Sobol samples of a pixel (`Pass.sobol_sampler`). The interior term
+    # uses set 0. The function `pixel_sweep` uses the first `pixel_samples.SETS` sets.
+    FLOW = 0x10  # paths for the gradient term of the film flow (`integrators.film.motion`)
+    FLOW_MEAN = 0x11  # paths that estimate the mean radiance, which the term of the film flow subtracts
+    # A hash of the value and the seed of an image is the seed of the stream.
     SECOND_IMAGE = 0x2B5AD2C7  # a second, independent image of one view
     SECOND_HALF = 0x5E1C93A7  # the second half of the samples of one view
 

@@ -33,7 +33,10 @@ def ball(splits: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def knobs(directions: np.ndarray) -> np.ndarray:
-    """Return the surface points (n, 3) of a body with four knobs, in these ``directions``. The body has length 1."""
+    """Return points (n, 3) on the surface of a body with four knobs. The body has length 1.
+
+    The points lie in the given unit ``directions`` (n, 3), as seen from the origin inside the body.
+    """
     radius = np.full(len(directions), 0.4)
     for at, height, sharpness in _KNOBS:
         radius += height * np.exp(sharpness * (directions @ (np.array(at) / np.linalg.norm(at)) - 1))

@@ -12,10 +12,10 @@ from pathreplay.scenes.caustics import caustic_lens, caustic_mirror
 from pathreplay.types import SceneDict
 
 COSTS: dict[str, Callable[[int], int]] = {
-    "texture": lambda n: 64 * n**2,  # per texel: three numbers, with copies in double precision
-    "grid": lambda n: 256 * n**3,  # per voxel: the 12 waves of the noise, all in memory at once
-    "views": lambda n: 100_000 * n,  # per view: a sensor with its film
-    "columns": lambda n: 1000 * n**2,  # per vertex, with its faces, for about as many rows as columns
+    "texture": lambda n: 64 * n**2,  # per texel: three numbers, and their copies in double precision
+    "grid": lambda n: 256 * n**3,  # per voxel: the 12 waves of the noise, which are in memory together
+    "views": lambda n: 100_000 * n,  # per view: a sensor and its film
+    "columns": lambda n: 1000 * n**2,  # per vertex: its data and faces, if there are as many rows as columns
     "rows": lambda n: 1000 * n**2,
     "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # eight faces, each split into four n times
 }
@@ -343,7 +343,10 @@ def _cumulus(size: int) -> np.ndarray:
 
 
 def _sky(rows: int) -> np.ndarray:
-    """Return a sky, blue above and dim below. The sun, 50 degrees high, is blurred over 8 degrees, so paths hit it."""
+    """Return a sky with a sun, blue above and dim below.
+
+    The sun is 50 degrees high. It is blurred over 8 degrees, so that paths hit the sun.
+    """
     v, u = _centres(rows, 2 * rows)
     θ, φ = np.pi * v, 2 * np.pi * u
     d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)  # as in Mitsuba's envmap

@@ -1,4 +1,7 @@
-"""Compares runs by a table of their results and of differences between their jobs, and a page of curves and images."""
+"""Compares runs. A table shows the results of the runs and the differences between their jobs.
+
+A page shows this table with curves and images.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""An HTTP server for one run, with its page, the images of the page, and a request to stop the run.
+"""An HTTP server for one run. It serves the page of the run and its images, and accepts a request to stop the run.
 
-All paths begin with a token that only the user who started the server knows. The Host header of each request is
-checked, to refuse pages of another host whose name resolves to this machine (DNS rebinding).
+All paths begin with a token that only the user who started the server knows. The Host header of each request is checked
+against DNS rebinding. In this attack, the host name of another web page is made to resolve to this machine, so that a
+browser lets the page send requests to this server.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 Request: TypeAlias = "socket.socket | tuple[bytes, socket.socket]"
 
-# Seconds within which a client must send its request. Also the timeout of sending the answer.
+# Seconds within which a client must send its request. The same number is the timeout for sending the answer.
 PATIENCE = 30
 # Maximum number of concurrent connections, which is enough for several browsers. Further connections are closed.
 MOST = 32
@@ -81,7 +82,10 @@ class RunServer(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
     def knows(self, host: str) -> bool:
-        """Return whether a Host header is a numeric address or a name of this machine; other requests are refused."""
+        """Return whether a Host header is a numeric address or a name of this machine.
+
+        The server refuses requests with any other Host header.
+        """
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:
@@ -174,7 +178,7 @@ class Handler(BaseHTTPRequestHandler):
         if not secrets.compare_digest(token.encode("utf-8", "replace"), self.server.token.encode()):
             self._answer(403, "text/plain", b"use the full address that pathreplay watch printed\n")
             return None
-        if not slash:  # the browser would resolve the page's relative addresses wrongly
+        if not slash:  # without the slash, a browser would resolve relative addresses wrongly
             self._answer(404, "text/plain", b"the address must end with a /\n")
             return None
         return place

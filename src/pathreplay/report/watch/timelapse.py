@@ -82,7 +82,8 @@ def _pictures(run: Path, view: str | None) -> list[PIL.Image.Image]:
         now = {"target": target, f"after {i} iterations": _opened(by_what[f"view-{chosen}"][i])}
         now |= {what.split("-", 1)[1]: _opened(by_what[what][i]) for what in beside}
         sheets.append(now)
-    # Frames of a refined grid have different resolutions. All images are scaled to the size of the last frame.
+    # If a grid was refined during the run, the resolution of its frames varies. The sizes in the last frame are used
+    # for all frames.
     sizes = [(max(2, round(p.width * HEIGHT / p.height)), HEIGHT) for p in sheets[-1].values()]
     return [_side_by_side(now, sizes) for now in sheets]
 
