@@ -32,16 +32,19 @@ def caustic_lens(  # noqa: PLR0913 (keywords of a job)
 ) -> SceneDict:
     """Describe a glass slab between a light and a white receiver, on which the slab casts a caustic.
 
-    The slab has the width 1 and the thickness 0.2. Its exit surface is in the plane z = 0. `slab` creates it for a
-    height map of ``rows`` x ``columns``. The receiver is at z = ``distance``. Collimated light falls perpendicularly on
-    the whole entry surface. With ``source_distance``, the light comes from a point at this distance from the entry
-    surface, and a black frame blocks the light that would miss the exit surface. ``irradiance`` is the irradiance at
-    the centre of the entry surface.
+    The slab has the width 1 and the thickness 0.2. Its exit surface is in the plane z = 0. The function `slab` creates
+    the mesh for a height map of ``rows`` x ``columns``. The receiver is at z = ``distance``. Collimated light falls
+    perpendicularly on the whole entry surface. With ``source_distance``, the light comes from a point at this distance
+    from the entry surface, and a black frame blocks the light that would miss the exit surface. ``irradiance`` is the
+    irradiance at the centre of the entry surface.
 
-    The camera sees a part of the receiver of width ``receiver_width``, with x to the right and y down. It is halfway
-    between slab and receiver, and casts no shadow. The key of the slab's vertices is ``lens.vertex_positions``. The
-    mesh attribute ``vertex_weight`` selects the vertices of the exit surface for displacements. With ``two_surfaces``,
-    ``vertex_entry_weight`` selects the vertices of the entry surface.
+    The camera is halfway between slab and receiver, and casts no shadow. It sees a part of the receiver of width
+    ``receiver_width``, with x to the right and y down.
+
+    The scene parameter ``lens.vertex_positions`` contains the vertices of the slab. The mesh attribute
+    ``vertex_weight`` is 1 at the vertices of the exit surface and 0 below, so that a height map can be applied to the
+    exit surface only. With ``two_surfaces``, the attribute ``vertex_entry_weight`` selects the vertices of the entry
+    surface.
     """
     high = rows / columns
     glass = {"type": "dielectric", "int_ior": eta, "ext_ior": 1.0}
@@ -68,14 +71,16 @@ def caustic_mirror(
 ) -> SceneDict:
     """Describe a mirror that reflects light onto a white receiver, on which it casts a caustic.
 
-    The mirror has the width 1 and faces +z in the plane z = 0. `sheet` creates it for a height map of ``rows`` x
-    ``columns``. Light arrives along (sin α, 0, -cos α), where α is ``angle`` in degrees. The light is collimated, or
-    comes from a point at ``source_distance`` from the centre of the mirror. ``irradiance`` is the irradiance of a plane
-    perpendicular to the light, at the centre of the mirror. The receiver is parallel to the mirror at z = ``distance``.
-    Its centre is the point to which a flat mirror reflects the light that arrives at the centre of the mirror.
+    The mirror has the width 1. It is in the plane z = 0 and faces +z. The function `sheet` creates the mesh for a
+    height map of ``rows`` x ``columns``. Light arrives along (sin α, 0, -cos α), where α is ``angle`` in degrees. The
+    light is collimated, or comes from a point at the distance ``source_distance`` from the centre of the mirror.
+    ``irradiance`` is the irradiance at the centre of the mirror, on a plane perpendicular to the light.
 
-    The camera sees a part of the receiver of width ``receiver_width``, with x to the right and y down. The key of
-    the mirror's vertices is ``mirror.vertex_positions``.
+    The receiver is parallel to the mirror, at z = ``distance``. A flat mirror would reflect the light that arrives at
+    the centre of the mirror to the centre of the receiver. The camera sees a part of the receiver of width
+    ``receiver_width``, with x to the right and y down.
+
+    The scene parameter ``mirror.vertex_positions`` contains the vertices of the mirror.
     """
     if not 10 <= angle <= 80:
         raise PathreplayError(f"The angle of the mirror is {angle:g}; give 10 to 80 degrees, so that nothing is shaded")
@@ -86,13 +91,17 @@ def caustic_mirror(
     half = _half(rows, columns)
     if source_distance is not None:
         return scene | {"lamp": _point(-source_distance * along, along, half, 0.0, irradiance)}
-    # The beam is wider than the mirror, and also covers a displaced mirror. The lamp does not block reflected light.
+    # The beam is wider than the mirror, so that it also covers a displaced mirror. At this distance, the lamp does not
+    # block reflected light.
     half = half * [np.cos(α), 1] + 0.1
     return scene | {"lamp": _collimated(-2 * _WIDTH / np.sin(α) * along, along, half, irradiance)}
 
 
 def _observed(resolution: int, high: float, distance: float, receiver_width: float, x: float) -> SceneDict:
-    """Describe the camera, and the receiver centred at (x, 0, ``distance``). ``high`` is height divided by width."""
+    """Describe the camera, and the receiver centred at (x, 0, ``distance``).
+
+    ``high`` is the height of the image divided by its width.
+    """
     T = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": resolution, "height": round(resolution * high), "pixel_format": "luminance"}
     return {
@@ -114,12 +123,18 @@ def _observed(resolution: int, high: float, distance: float, receiver_width: flo
 
 
 def _half(rows: int, columns: int) -> Array:
-    """Return half the width and height of a surface whose map has width 1. Its border is half a cell inside the map."""
+    """Return half of the width and half of the height of a surface, whose height map has the width 1.
+
+    The surface ends half a cell inside the map.
+    """
     return np.array([columns - 1, rows - 1]) / columns * _WIDTH / 2
 
 
 def _collimated(centre: Array, along: Array, half: Array, irradiance: float) -> SceneDict:
-    """Describe a rectangle of half width and half height ``half``, which emits light perpendicularly."""
+    """Describe a rectangle that emits light perpendicularly to its surface.
+
+    ``half`` contains half of its width and half of its height.
+    """
     place = mi.ScalarTransform4f().look_at(origin=centre.tolist(), target=(centre + along).tolist(), up=[0, 1, 0])
     return {
         "type": "rectangle",
@@ -146,7 +161,10 @@ def _point(origin: Array, axis: Array, half: Array, z: float, irradiance: float)
 
 
 def _frame(hole: Array, outer: Array, z: float) -> mi.Mesh:
-    """Create a black frame in the plane z = const; ``hole`` and ``outer`` are half widths and half heights."""
+    """Create a black frame in the plane z = const.
+
+    ``hole`` contains half of the width and half of the height of the hole, and ``outer`` those of the whole frame.
+    """
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     vertices = np.concatenate([corners * hole, corners * outer])
     i, j = np.arange(4), np.roll(np.arange(4), -1)
@@ -155,9 +173,10 @@ def _frame(hole: Array, outer: Array, z: float) -> mi.Mesh:
 
 
 def _at_entry(r: float, s: float, eta: float) -> float:
-    """Return the distance from the axis at which light from a point at the distance ``s`` enters the slab.
+    """Return the distance from the axis at which a ray from a point light enters the slab.
 
-    The light leaves the slab at the distance ``r``.
+    The point light is on the axis, at the distance ``s`` from the slab. The ray leaves the slab at the distance ``r``
+    from the axis.
     """
     sine = np.linspace(0, 0.999, 10000)
     enters = s * sine / np.sqrt(1 - sine**2)
@@ -231,7 +250,10 @@ def _grid(rows: int, columns: int, width: float) -> tuple[Array, NDArray[np.inte
 
 
 def _mesh(vertices: Array, faces: NDArray[np.integer], width: float, high: float, bsdf: dict[str, object]) -> mi.Mesh:
-    """Create a mesh whose texture coordinates are the coordinates on its map. ``high`` is height divided by width."""
+    """Create a mesh whose texture coordinates are the coordinates on its height map.
+
+    ``width`` is the width of the map, and ``high`` its height divided by its width.
+    """
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
     texcoords = vertices[:, :2] / np.array([width, width * high]) + 0.5

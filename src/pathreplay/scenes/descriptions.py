@@ -1,4 +1,4 @@
-"""Load objects from dictionaries, with checks for input that crashes Mitsuba and one-line error messages."""
+"""Load objects from dictionaries, reject input that crashes Mitsuba, and convert errors to one-line messages."""
 
 from __future__ import annotations
 

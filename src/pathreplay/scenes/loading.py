@@ -98,7 +98,7 @@ def load_scene_for(
     /,
     **parameters: object,
 ) -> tuple[mi.Scene, tuple[str, ...]]:
-    """Load a scene in which ``wanted`` keys and globs are differentiable, replacing plugins where necessary.
+    """Load a scene, and replace plugins where this makes the ``wanted`` parameters (keys, globs) differentiable.
 
     If a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded again with
     `dielectric_ad` in place of every ``dielectric``. If a pattern that ends in ``data`` matches an 8-bit texture, the
@@ -138,14 +138,14 @@ def load_scene_with_floats(
 
 
 def coarse_pictures(params: mi.SceneParameters, wanted: Iterable[str]) -> tuple[str, ...]:
-    """Return the image files of 8-bit textures that match ``wanted``: the keys and globs that end in ``data``."""
+    """Return the image files of 8-bit textures that match a pattern in ``wanted`` whose last part is ``data``."""
     owners = [params.properties[key][2] for key in _matching(params, wanted, "data")]
     matches = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
     return tuple(dict.fromkeys(match[1] for match in matches if match))
 
 
 def _matching(params: mi.SceneParameters, wanted: Iterable[str], name: str) -> list[str]:
-    """Return the keys that match those patterns whose last part is ``name``."""
+    """Return the keys that match a pattern in ``wanted`` whose last part is ``name``."""
     keys: list[str] = []
     for pattern in wanted:
         if pattern.rsplit(".", 1)[-1] == name:
@@ -172,7 +172,7 @@ def builtin_dict(name: str, parameters: Mapping[str, object]) -> SceneDict:
 
 
 def _remedy(kind: str, value: object) -> str:
-    """Return what to give for an argument of a built-in scene; empty if the value is right."""
+    """Describe the valid values of a built-in scene's argument. Return an empty string if ``value`` is valid."""
     if kind == "bool":
         return "" if isinstance(value, bool) else "true or false"
     if kind == "float":

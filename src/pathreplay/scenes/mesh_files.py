@@ -82,7 +82,10 @@ def _ply_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
 
 
 def _triangles(file: BinaryIO, elements: list[_Element], form: str) -> np.ndarray | None:
-    """Read the vertex indices (n, 3). Return None for missing data or other polygons: Mitsuba rejects both."""
+    """Read the vertex indices (n, 3). Return None if data are missing or a face is not a triangle.
+
+    Mitsuba rejects such files.
+    """
     vertex, face = (element.layout(form) for element in elements[:2])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy warns if text follows the numbers

@@ -94,7 +94,9 @@ def owner_class(params: mi.SceneParameters, key: str) -> str:
 
 
 def require_differentiable(params: mi.SceneParameters, key: str, integrator: mi.Integrator | None = None) -> None:
-    """Raise PathreplayError unless ``integrator`` (None: any integrator of Mitsuba) can differentiate ``key``.
+    """Raise PathreplayError unless ``integrator`` can differentiate the parameter ``key``.
+
+    If ``integrator`` is None, the integrators of Mitsuba must be able to differentiate it.
 
     The error is raised for missing keys, plain numbers, integers, empty arrays, and most parameters with the flag
     ``mi.ParamFlags.NonDifferentiable`` (see `carries_derivative`). The message names a remedy if there is one.
@@ -156,8 +158,8 @@ def carries_derivative(params: mi.SceneParameters, key: str, integrator: mi.Inte
     """Return whether a parameter is differentiable.
 
     Differentiable parameters are non-empty Dr.Jit float arrays without the flag ``mi.ParamFlags.NonDifferentiable``.
-    Cameras and the motion of emitters have this flag, but ``pathreplay`` differentiates them unless ``attach`` is
-    'none'.
+    Parameters of cameras, and parameters that move emitters, have this flag. The integrator ``pathreplay``
+    differentiates them nevertheless, unless its ``attach`` is 'none'.
     """
     if not _is_float(params[key]) or is_empty(params[key]):
         return False

@@ -33,12 +33,13 @@ _VOL_MAGIC = b"VOL\x03"
 _VOL_HEADER = struct.Struct("<4s5i6f")
 _FLOAT32 = 1
 
-# Largest number of voxels: 4 GiB of float32. The bounding box of a larger grid is probably wrong.
+# Largest number of voxels of a grid: 4 GiB of float32. The bounding box of a larger grid is probably wrong.
 _MOST_VOXELS = 2**30
-# Largest number of voxels of a NanoVDB grid. They are read one by one, a million per second: half a minute.
+# Largest number of voxels of a NanoVDB grid. Reading them one by one takes half a minute, at a million per second.
 _MOST_ASKED_FOR = 2**25
 
-# Largest absolute value. At higher extinctions, free paths are far shorter than the resolution of single precision.
+# Largest absolute value of a voxel. At higher extinctions, free paths are far shorter than the resolution of single
+# precision.
 _LARGEST = 1e12
 
 
@@ -244,7 +245,8 @@ def _read_nvdb(path: Path, grid: str | None) -> Volume:
         shape = _size(where, low, high, _MOST_ASKED_FOR)
         voxel = np.array([file.voxel_size(index, axis) for axis in range(3)])
         first, last = (np.array(corner) for corner in file.world_bbox(index))
-        # tinyvdb does not expose the matrix. Without rotation the world box is the index box times the voxel size.
+        # tinyvdb does not expose the index-to-world matrix. If this matrix does not rotate or shear, the extent of the
+        # world box is the number of voxels along each axis times the voxel size.
         if not np.allclose(last - first, voxel * shape, rtol=1e-4):
             raise PathreplayError(f"{where} is rotated or sheared in its world, which cannot be read; save it as .vdb")
         x, y, z = (range(a, b + 1) for a, b in zip(low.tolist(), high.tolist(), strict=True))

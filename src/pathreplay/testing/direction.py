@@ -41,7 +41,7 @@ class Line:
     stencil: Stencil
 
     def move(self, value: SceneValue, t: mi.Float) -> SceneValue:
-        """Return the point at t, computed from the parameter's ``value`` and of the same type as the value."""
+        """Return ``value`` + t * direction, as an object of the type of ``value``."""
         return displaced(value, self.direction, t)
 
 
@@ -57,11 +57,14 @@ def choose_line(
 ) -> Line:
     """Choose the line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
 
-    By default, the largest change of an entry is a hundredth of the parameter's size. The differences are one-sided if
-    a step would make a non-negative parameter negative, for example a black texel, because negative roughness or
-    density is invalid. The random direction of a transform is a translation. Infinitely ``far`` emitters (sun, sky) are
-    rotated about a random axis instead, because translation does not change them. For coefficients of ``spectra``, the
-    steps apply to the decoded values: see :mod:`pathreplay.scenes.spectra`.
+    By default, the step is a hundredth of the parameter's size (see `Line`). The differences are one-sided if a step
+    would make a non-negative parameter negative, for example a black texel, because negative roughness or density is
+    invalid.
+
+    The random direction of a transform is a translation. If ``far``, the transform belongs to an infinitely distant
+    emitter (sun, sky), which translation does not change. The random direction is then a rotation about a random axis.
+    If ``spectra``, the parameter consists of coefficients of spectra. The default step then changes the values of the
+    polynomial p by at most a hundredth: see :mod:`pathreplay.scenes.spectra`.
 
     Raises PathreplayError for a direction that has another shape, is zero or not finite, and for a step that is not a
     positive number, or is too long or too short for the parameter.

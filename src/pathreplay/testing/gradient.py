@@ -196,7 +196,10 @@ class _Plan:
 def line_of(
     params: mi.SceneParameters, key: str, by: mi.Integrator, step: float | None, direction: ArrayLike | None, seed: int
 ) -> Line:
-    """Choose the line of a check. Raises PathreplayError for a parameter without derivative or in half precision."""
+    """Choose the line in parameter space along which a check moves the parameter ``key``.
+
+    Raises PathreplayError for a parameter without derivative or in half precision.
+    """
     require_differentiable(params, key, by)
     require_finite(params)
     value, owner = get_array(params[key]), params.properties[key][2]

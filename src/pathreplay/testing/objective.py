@@ -49,7 +49,7 @@ class Objective:
     """The objective F(t) for a scene whose parameter ``key`` moves along a curve, seen by one sensor.
 
     ``move(value, t)`` is the parameter's value at t; at t = 0 it is ``value``, the value in the scene. Unless stated
-    otherwise, all images of a method use the same seed, i.e. common random numbers.
+    otherwise, all images that one call of a method renders have the same seed, i.e. common random numbers.
     """
 
     def __init__(self, scene: mi.Scene, params: mi.SceneParameters, key: str, move: Move, sensor: int = 0) -> None:
@@ -153,7 +153,8 @@ class Objective:
 
     def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
         """Judge gradients by finite differences: ``full`` with the step of the line, ``half`` with half this step."""
-        # Worst case: rounding errors of half a unit in the last place of every image, all of the same sign.
+        # Worst case: every value of every image has a rounding error of half a unit in the last place, and all these
+        # errors have the same sign.
         unit = np.finfo(get_array(self.value).dtype).eps / 2
         rounding = line.stencil.rounding() * unit * self.scale / line.step
         return judge(gradients, full, half, rounding=rounding, negligible=NEGLIGIBLE * self.scale / line.size)

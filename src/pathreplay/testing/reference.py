@@ -34,8 +34,8 @@ def integrator_under_test(
     """Return the integrator that ``spec`` describes: an object (used unchanged), a dictionary, a plugin name, or None.
 
     None selects the scene's own integrator if it is differentiable, else ``pathreplay``. A plugin given by name, or
-    selected by None, gets the path limits of the scene's own integrator. ``max_depth`` overrides their path length, and
-    ``boundary`` contains additional properties of `pathreplay` (``boundary``, ``boundary_spp``).
+    selected by None, gets the path limits of the scene's own integrator. ``max_depth`` replaces the path length of the
+    integrator. ``boundary`` contains additional properties of `pathreplay` (``boundary``, ``boundary_spp``).
 
     Raises PathreplayError if Mitsuba cannot create the integrator, if ``max_depth`` is invalid or given with an object,
     or if boundary terms are requested from another integrator than `pathreplay`.

@@ -1,13 +1,14 @@
 """The verdict on a gradient, computed from two sets of independent samples.
 
-The inputs are n samples of the gradient under test and n samples of the reference, all from independent seeds. The
-reference consists of two finite differences per seed, with steps h and h/2, whose error is O(h²). The Richardson
-extrapolation (4 D(h/2) - D(h)) / 3 removes this error term. The change from D(h) to D(h/2), as far as it exceeds the
-noise, bounds the remaining error.
+The inputs are n samples of the gradient under test and n samples of the reference, all from independent seeds. For each
+seed, the reference consists of two finite differences, D(h) and D(h/2), with the steps h and h/2. A finite difference
+has an error of O(h²). The Richardson extrapolation (4 D(h/2) - D(h)) / 3 removes this error term. The change from D(h)
+to D(h/2), as far as it exceeds the noise, bounds the remaining error. This bound, combined with the rounding error of
+the reference, is step_error.
 
-    σ² = se(gradient)² + se(reference)² + step_error² + rounding²,      z = (mean gradient - mean reference) / σ
+    σ² = se(gradient)² + se(reference)² + step_error² + summation²,      z = (mean gradient - mean reference) / σ
 
-where rounding, the error of float32 sums, is `SUMMATION` times the larger of the two means.
+Here summation, the error of float32 sums, is `SUMMATION` times the larger absolute value of the two means.
 
 ``z`` is converted to a normal deviate, independent of the number of samples: see :mod:`pathreplay.testing.statistics`.
 """

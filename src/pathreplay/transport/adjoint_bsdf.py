@@ -1,7 +1,8 @@
 """BSDFs on light paths: the adjoint of the scattering that camera paths use.
 
-Camera paths weight light from ω_l, scattered into ω_c, by F = f(ω_c, ω_l) |ω_l·n_s|, with n_s the shading normal. A
-light path carries flux, which is proportional to the cosine with the geometric normal n_g. It therefore uses
+Let n_s be the shading normal and n_g the geometric normal. On camera paths, light that arrives from ω_l and is
+scattered into ω_c has the weight F = f(ω_c, ω_l) |ω_l·n_s|. Light paths carry flux, which is proportional to the cosine
+between direction and geometric normal. On light paths, the weight is therefore
 
     F |ω_c·n_g| / |ω_l·n_g|        [Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, p. 155]
 

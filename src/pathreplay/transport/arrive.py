@@ -90,7 +90,7 @@ def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.B
 
 
 def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
-    """Return the MIS-weighted environment radiance along rays that ``left`` the scene, differentiably."""
+    """Return the MIS-weighted environment radiance along rays that leave the scene (mask ``left``), differentiably."""
     if trace.scene.environment() is None or trace.to_sensor is not None:
         return mi.Spectrum(0)
     si = dr.zeros(mi.SurfaceInteraction3f)

@@ -1,4 +1,4 @@
-"""Find which parts of a path depend on differentiated parameters, so that kernels omit derivatives of other parts."""
+"""Find which parts of a path depend on differentiated parameters. Kernels omit the derivatives of all other parts."""
 
 from __future__ import annotations
 
@@ -62,11 +62,12 @@ def path_moves(trace: TraceConfig, start: Start, at: Arrival) -> bool:
 
 
 def edges_move(trace: TraceConfig, start: Start, at: Arrival) -> bool:
-    """Return whether visibility edges may move: occluders, path vertices or emitters depend on gradients.
+    """Return whether visibility edges may move.
 
-    The test is the same as in `path_moves`, with two differences. Texture coordinates and the tangents computed from
-    them do not count, because a texture occludes nothing. A projector or spot light that rotates counts, because the
-    boundary of the lit region moves although the position of the light does not.
+    Edges may move if occluders, path vertices or emitters depend on parameters with gradients. The test is that of
+    `path_moves`, with two differences. Texture coordinates and the tangents computed from them do not count, because a
+    texture occludes nothing. A rotation of a projector or spot light counts, because the boundary of the lit region
+    moves although the position of the light does not.
     """
     lights = [*trace.traits.projectors, *trace.traits.spots]
     turns = trace.attach != "none" and any(with_gradients(light, "to_world", "cutoff_angle") for light in lights)
@@ -82,7 +83,8 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        # `edges_move` ignores attached rough lobes: with attach = 'delta', they occur only in scenes without outlines.
+        # `edges_move` ignores smooth lobes that are sampled attached. Boundary terms need attach = 'delta', and such
+        # lobes then exist only in scenes without outlines.
         for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
             moving.append(sample.wo)
@@ -97,7 +99,7 @@ def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
     The result is valid only if the paths do not move. ``at`` is the first arrival. The function records the weight of a
     lobe symbolically, like later passes, and checks whether the weight has gradients. Nothing is evaluated.
     """
-    lobe, valid = at.hit.prim_index, at.hit.is_valid()  # values unknown at trace time
+    lobe, valid = at.hit.prim_index, at.hit.is_valid()  # arrays whose values Dr.Jit does not know while it traces
     si = at.hit.compute_surface_interaction(at.ray, compat.shading(), valid)
     v = Vertex(si, si.bsdf(at.ray), valid, si, mi.Spectrum(0))
     kept = SampledContinuation(si.to_world(si.wi), mi.Float(1), lobe == 0, mi.Bool(False), lobe, valid)

@@ -90,7 +90,7 @@ def _unoccluded(trace: TraceConfig, v: arrive.Vertex, to: Sighting, active: mi.B
 
 
 def _weighted(link: SensorLink, splat: Splat, at: Arrival, lit: mi.Bool) -> mi.Spectrum:
-    """Return the contribution times the adjoint of the image; zero if there is no adjoint."""
+    """Return a vertex's contribution to the film, times the adjoint of the image; zero if there is no adjoint."""
     if link.adjoint is None:
         return mi.Spectrum(0)
     return dr.select(lit, splat.c * link.adjoint(splat.s, at.ray.wavelengths, lit), 0)

@@ -1,4 +1,4 @@
-"""The path state that all drivers share, and its transition to the next vertex."""
+"""The state of a path in the loops that trace paths, and its transition to the next vertex."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PathState:
     at: Arrival
     β: mi.Spectrum  # throughput
     # β, but with the first zero weight of each channel replaced (see `sustain`). Termination depends on β_alive and not
-    # on β, so that paths with derivatives continue. None if zero weights end paths.
+    # on β, because a path whose β is zero may have nonzero derivatives. None if zero weights end paths.
     β_alive: mi.Spectrum | None
     η: mi.Float  # product of the relative indices of refraction since the camera
     depth: mi.UInt32  # number of vertices before this one
@@ -33,7 +33,10 @@ class PathState:
 
     @staticmethod
     def begin(trace: TraceConfig, start: Start, sustained: bool = False) -> PathState:
-        """Start paths at their first vertices; if ``sustained``, zero weights do not end paths with derivatives."""
+        """Start paths at their first vertices.
+
+        If ``sustained``, the first zero weight does not end a path: see `sustain`.
+        """
         active = mi.Bool(start.active) & (trace.max_depth > 0)
         β_alive = mi.Spectrum(1) if sustained else None
         return PathState(start.choose(trace, active), mi.Spectrum(1), β_alive, mi.Float(1), mi.UInt32(0), active)
@@ -61,7 +64,7 @@ class PathState:
     ) -> tuple[PathState, VertexRecord]:
         """Move to the next vertex; return the new state and the record of the previous vertex for later passes.
 
-        ``at`` is the next arrival, if the caller has already traced it.
+        ``at`` is the arrival at the next vertex, if the caller has already traced the continuation.
         """
         β = self.β * dr.detach(step.w)
         β_alive = None if self.β_alive is None else sustain(self.β_alive, self.β, step)
@@ -107,7 +110,7 @@ def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spe
 
 
 def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.Bool) -> Arrival:
-    """Trace the continuation of a step, taken from ``at``, to the next vertex.
+    """Trace the continuation of a step to the next vertex. ``at`` is the arrival at the vertex of the step.
 
     MIS ignores null boundaries between media: the density of the last scattering event remains in effect behind them.
     """

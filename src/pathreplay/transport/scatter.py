@@ -182,12 +182,12 @@ def _at_surface(
 
 
 def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Return the lanes with narrow lobes, in which smooth continuations have a fixed direction.
+    """Return the lanes whose smooth continuations have a fixed direction, because the lobe is narrow.
 
     If the direction followed a moving hit point, the value of the lobe would change with the direction. In a narrow
-    lobe, this derivative is large and noisy. Edges may move across a fixed direction, and their motion is a boundary
-    term. All lanes are therefore False unless boundary terms are estimated. The criterion depends on vertex and
-    incident ray only, so that all directions sampled at a vertex move by the same rule.
+    lobe, this change is a large and noisy derivative. Edges may move across a fixed direction, which requires a
+    boundary term. The result is therefore False in all lanes unless boundary terms are estimated. The criterion depends
+    on vertex and incident ray only, so that one rule applies to all directions sampled at a vertex.
     """
     if not (trace.may_slide and trace.traits.glossy):
         return mi.Bool(False)
@@ -196,11 +196,12 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
 
 
 def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Return the lanes whose hit surface passes part of the light unscattered. These lanes have a fixed direction.
+    """Return the lanes whose hit surface passes part of the light unscattered.
 
-    A direction that followed the motion of such a surface would move across the surfaces behind it and across their
-    edges. With a fixed direction, the outline of the transparent surface needs a boundary term. All lanes are therefore
-    False unless boundary terms are estimated.
+    A smooth continuation to such a surface has a fixed direction. A direction that followed the motion of the surface
+    would move across other surfaces behind it, and across their edges. With a fixed direction, the outline of the
+    transparent surface needs a boundary term. The result is therefore False in all lanes unless boundary terms are
+    estimated.
     """
     if not (trace.may_slide and trace.traits.veils):
         return mi.Bool(False)
@@ -259,7 +260,7 @@ def _delta_weight(
 def _at_particle(
     trace: TraceConfig, v: Vertex, again: VertexRecord, attached: bool, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
-    """Evaluate weight, direction and density of the continuation from a collision in a medium again.
+    """Evaluate again the weight, direction and density of a continuation that starts at a collision in a medium.
 
     If the next surface scatters or emits light, the direction follows the hit point, because such a surface may have
     edges and texture seams. Towards any other surface, the direction is constant, which is less noisy.

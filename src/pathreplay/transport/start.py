@@ -30,7 +30,7 @@ class Start(Protocol):
 
 @dataclass
 class CameraStart:
-    """The start of paths at camera rays. The adjoint q_0 of a path is back-propagated through its camera ray."""
+    """The start of paths at camera rays. Reverse passes back-propagate the adjoint of each camera ray to the camera."""
 
     ray: mi.Ray3f  # attached to the camera's parameters, if these have gradients
     sampler: Sampler  # source of the random numbers of the paths

@@ -92,9 +92,9 @@ class SurfacePoint:
 def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> SurfacePoint:
     """Return the point that ``ray`` hit, with fixed surface coordinates.
 
-    On meshes, the area vector A is the cross product of two sides of the triangle. Derivatives of the position with
-    respect to texture coordinates are unsuitable: they vanish if the coordinates are degenerate, and depend on any
-    motion of the coordinates.
+    On meshes, the area vector A is the cross product of two sides of the triangle. A is not computed from derivatives
+    of the position with respect to texture coordinates: these derivatives vanish if the texture coordinates are
+    degenerate, and change if the texture coordinates move.
     """
     on_mesh = active & hit.shape.is_mesh()
     y = hit.compute_surface_interaction(ray, compat.normal_partials() | compat.follow_shape(), active)

@@ -1,4 +1,4 @@
-"""Records passed between the step and the drivers: configuration, random numbers, recorded choices, results."""
+"""Data passed between `step` and the loops over path vertices: configuration, random numbers, choices, results."""
 
 from __future__ import annotations
 
@@ -76,13 +76,16 @@ class TraceConfig:
 
     @property
     def follows(self) -> bool:
-        """Whether smooth lobes may be sampled attached; if ``delta``, only narrow lobes in scenes without outlines."""
+        """Whether smooth lobes may be sampled attached.
+
+        With ``attach='delta'``, only narrow lobes in scenes without outlines are sampled attached.
+        """
         narrow = self.attach == "delta" and not self.traits.outlines
         return bool(self.traits.attachables) and (narrow or self.attach == "all")
 
     @property
     def branch(self) -> bool:
-        """Whether one null collision per path is kept (see `null_branching`)."""
+        """Whether an extra path starts at one null collision of each path (see `null_branching`)."""
         return self.branching is not None
 
     @property
@@ -102,7 +105,7 @@ class VertexSamples:
 
     @staticmethod
     def draw(sampler: Sampler) -> VertexSamples:
-        """Draw the random numbers of one vertex, in the order that all drivers share."""
+        """Draw the random numbers of one vertex, always in this order."""
         return VertexSamples(sampler.next_2d(), sampler.next_1d(), sampler.next_2d(), sampler.next_1d())
 
 
@@ -124,7 +127,7 @@ class Arrival:
 
 @dataclass
 class SampledContinuation:
-    """The choices of the sampling pass at a vertex. Later passes use the same values and add derivatives."""
+    """The choices of the sampling pass at a vertex. Later passes reuse these values and add derivatives."""
 
     d: mi.Vector3f  # sampled direction, world space
     pdf: mi.Float  # solid-angle density of ``d``, or the probability of the delta lobe
@@ -139,7 +142,7 @@ class SampledContinuation:
 
 @dataclass
 class SampledInMedia:
-    """Additional choices in a scene with media."""
+    """The choices of the sampling pass at a vertex that exist only in scenes with media."""
 
     null: mi.Bool  # the continuation passes the surface unscattered
     flight: Flight  # the flight to the vertex
@@ -148,7 +151,7 @@ class SampledInMedia:
 
 @dataclass
 class Flight:
-    """The flight between two vertices, as sampled."""
+    """The sampled flight between two vertices."""
 
     event: mi.Bool  # a real collision happened before any surface
     t: mi.Float  # distance to the real collision
@@ -187,7 +190,9 @@ class NullCollision:
     """
 
     t: mi.Float  # distance of the collision along the ray
-    ω: mi.Spectrum  # W c branch_weight(p, c) / (σ̄ m), with W the product of the weights of earlier null collisions
+    # W c branch_weight(p, c) / (σ̄ m). Here W is the product of the weights of earlier null collisions on the flight, p
+    # the probability of a real collision, c the relative weight of null collisions, and σ̄ the majorant.
+    ω: mi.Spectrum
     bare: mi.Float  # ω without the factor W
     mass: mi.Float  # sum of m over all null collisions of the flight
     number: mi.Float  # number of null collisions of the flight
@@ -196,7 +201,7 @@ class NullCollision:
 
 @dataclass
 class Shadow:
-    """The transmittance between a vertex and its emitter sample, as sampled."""
+    """The estimated transmittance between a vertex and its emitter sample."""
 
     T: mi.Spectrum  # estimate of the transmittance, 0 if occluded
     y: mi.Float  # distance of the point at which the transmittance is differentiated
@@ -256,7 +261,7 @@ class Splat:
 
 @dataclass
 class Step:
-    """One vertex of a path, L_i = e_i + w_i L_{i+1}, together with the continuation r_{i+1}."""
+    """One vertex of a path, with L_i = e_i + w_i L_{i+1}, and the ray that continues the path."""
 
     e: mi.Spectrum  # emission (MIS weighted) + next-event estimate; on light paths, contribution times image adjoint
     w: mi.Spectrum  # f/p or lobe weight, before Russian roulette

@@ -1,7 +1,8 @@
 """Textures with discontinuities: checkerboards, bitmaps with nearest-neighbour lookup, face attributes of meshes.
 
-Boundary terms do not cover these discontinuities. If such a texture exists, film positions must not follow moving
-surfaces: a camera ray that moves with its film position would cross the discontinuities of static textures.
+Boundary terms do not cover these discontinuities. With `SurfaceFlow`, the film positions of camera rays move with the
+visible surfaces. A camera ray that moves would cross the discontinuities of textures on static surfaces. Film positions
+therefore do not move in a scene with such a texture.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class Tables:
     are created while `dr.freeze` records (see `_array`).
     """
 
-    attachable: mi.Bool | None  # for each BSDF, whether its smooth lobes may be sampled attached; None: no BSDF
+    attachable: mi.Bool | None  # for each BSDF, whether its smooth lobes may be sampled attached; None if all are False
     blend_lengths: mi.Float  # `velocity.blend_length` of each shape
     groups_at: mi.UInt32  # for each shape, the offset of its triangles in `groups`, or `WHOLE` or `FACETS`
     groups: mi.UInt32  # `smoothing_groups` of all meshes that have an offset, concatenated; entry 0 is unused
@@ -58,7 +58,7 @@ class Tables:
 
 @dataclass(frozen=True)
 class Traits:
-    """Facts about a scene on which the drivers depend."""
+    """Facts about the BSDFs, emitters and shapes of a scene, and about the gradients of their parameters."""
 
     mirrors: tuple[mi.BSDF, ...]  # BSDFs with delta lobes
     lobes: int  # one more than the largest component index of a delta lobe, 0 if there is none
@@ -82,7 +82,7 @@ class Traits:
     glossy: bool  # `narrow`, and no checkerboard exists (its seams are not covered by boundary terms)
     outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
     tables: Tables = None  # type: ignore[assignment]  # for the current pass, like all fields below
-    # Whether any of these has gradients:
+    # The fields `lights_deform` to `lights_vary` tell whether the parameters in their comments have gradients.
     lights_deform: bool = False  # vertex positions of an emissive mesh
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
@@ -94,7 +94,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     """Inspect all BSDFs and shapes of a scene, including nested BSDFs and instanced shapes.
 
     `SceneFacts` adds the tables and the facts about gradients. In scenes with media, null boundaries do not count as
-    mirrors, because the step passes light through them.
+    mirrors, because paths pass straight through null boundaries.
     """
     media = any(isinstance(node, mi.Medium) for node in nodes)
     bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and is_null(node))]

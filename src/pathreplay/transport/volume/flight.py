@@ -120,7 +120,7 @@ def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, acti
 def _emission_added(
     grid: Grid, mei: mi.MediumInteraction3f, E: mi.Spectrum, c: mi.Spectrum, active: mi.Bool
 ) -> mi.Spectrum:
-    """Add the emission at a tentative collision, which is the estimate for emission per unit length."""
+    """Add the weighted emission at a tentative collision to ``E``, if the grid emits per unit of length."""
     if grid.emission_per_extinction:
         return E
     return dr.select(active, E + c * dr.detach(grid.emission_at(mei, active)), E)
@@ -129,7 +129,10 @@ def _emission_added(
 def _emission_at_end(
     media: Media, mei: mi.MediumInteraction3f, E: mi.Spectrum, c: mi.Spectrum, real: mi.Bool
 ) -> mi.Spectrum:
-    """Return the emission at a real collision in media that emit per extinction: little noise if they are opaque."""
+    """Return the emission of a flight that ends at a real collision in a grid that emits per unit of optical depth.
+
+    This estimate has little noise in opaque media. In all other lanes, the result is ``E``.
+    """
     for grid in media.grids:
         if grid.emission is not None and grid.emission_per_extinction:
             glows = real & is_grid(grid, mei.medium)
@@ -147,7 +150,10 @@ def _tentative(
     σ: mi.Float,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
-    """Return the distance from ``t`` to the next tentative collision, and the majorant there (``σ`` outside grids)."""
+    """Return the distance from ``t`` to the next tentative collision, and the majorant at this collision.
+
+    Outside grids, the majorant is ``σ``.
+    """
     step = dr.select(σ > 0, -dr.log(1 - u) * dr.rcp(σ), dr.inf)
     for grid in trace.media.grids:
         mine = active & is_grid(grid, medium)
@@ -210,7 +216,8 @@ def fly_again(
 
     σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
     σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
-    if trace.branch:  # subtract the derivative that null collisions estimate, which is taken at a fixed position
+    if trace.branch:
+        # Null collisions estimate a part of the derivative, at fixed positions. This part is subtracted here.
         assert trace.branching is not None
         rest = 1 - flight.p * branch_weight(flight.p, trace.branching)
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
@@ -250,12 +257,15 @@ def _emission_again(
     attached: bool,
     in_medium: mi.Bool,
 ) -> mi.Spectrum:
-    """Return the emission along a flight; only its derivative is meaningful.
+    """Return the emission along a flight; only the derivative of the result is meaningful.
 
-    Emission per length is differentiated at one tentative collision, with the transmittance up to there. Emission per
-    extinction, ∫ T σ B ds, has three derivatives. Those of B and of the transmittance (``T``: 1, with its derivative
-    up to the end of the flight) are estimated at the real collision. That of σ is estimated at a tentative collision,
-    where σ may be zero.
+    Emission per unit of length is differentiated at one tentative collision. The transmittance up to this collision is
+    differentiated, too.
+
+    Emission per unit of optical depth is ∫ T σ B ds, with transmittance T, extinction σ and emitted radiance B. Three
+    derivatives are needed. The derivatives of T and B are estimated at the real collision. The argument ``T`` has the
+    value 1 and the derivative of the log transmittance up to the end of the flight. The derivative of σ is estimated at
+    a tentative collision, because tentative collisions also occur where σ is zero.
     """
     medium, ray, (a, b) = at.medium, at.ray, ends
     emitted = mi.Spectrum(0)
@@ -290,9 +300,10 @@ def _emission_again(
 
 
 def _scores_at_collisions(trace: TraceConfig, grid: Grid) -> bool:
-    """Return whether the control variate subtracts the score of a tentative collision instead of the real one.
+    """Return whether the control variate subtracts the score at a tentative collision instead of the real collision.
 
-    The derivative of emission per extinction by σ is estimated at this tentative collision: their noise cancels.
+    For emission per unit of optical depth, the derivative of σ is estimated at this tentative collision. The noise of
+    the score and the noise of this derivative then cancel.
     """
     return (
         trace.baseline is not None and not trace.branch and grid.emission is not None and grid.emission_per_extinction

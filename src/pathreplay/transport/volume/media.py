@@ -17,7 +17,7 @@ class Grid(Protocol):
     """A medium with its own free flight and transmittance: see `gridmedium`."""
 
     emission: mi.Volume | None
-    emission_per_extinction: bool  # `emission_at` is per unit of optical depth instead of length; used with emission
+    emission_per_extinction: bool  # `emission_at` is per optical depth, not per length; unused if `emission` is None
     is_chromatic: bool
 
     def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]: ...
