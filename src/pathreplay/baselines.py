@@ -1,7 +1,8 @@
 """Integrators to compare `pathreplay` with: `naive_ad`, `radiative_backprop` and `prb_volume_listing`.
 
-They use the same light-transport step as `pathreplay`, and show the memory, time and noise of other ways to
-differentiate a path tracer. `pathreplay` computes the same gradients at lower cost, or gradients that the others miss.
+These three integrators use the same light-transport step as `pathreplay`. They show the memory, time and noise of other
+ways to differentiate a path tracer. `pathreplay` computes the same gradients at lower cost, or gradients that the three
+integrators miss.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ def _global_options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Options of every command."""
+    """Parse the options that precede a command."""
 
 
 @app.command(short_help="Report what runs on this machine.")
@@ -191,7 +191,7 @@ def optimize(
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
 ) -> None:
-    """Recover scene parameters from images; Ctrl-C or SIGTERM ends early with everything written."""
+    """Recover scene parameters from images. Ctrl-C or SIGTERM ends the run early, with all results written."""
     if define:
         raise PathreplayError(f"-D is for scene parameters; change a job with: --set {define[0]}")
     with interrupts.undisturbed():  # a half-imported module can crash the process at its exit

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-# Characters. A longer message is shortened in the middle, because its two ends name the object and the remedy.
+# Maximum length of a message, in characters. A longer message is shortened in the middle, because its two ends name the
+# object and the remedy.
 _LONGEST = 1000
 
 

@@ -1,1 +1,1 @@
-"""Drivers, which differentiate light paths: primal, forward, recorded path with reverse sweep, and path replay."""
+"""Drivers: functions that trace paths to render them, or to differentiate them in forward or reverse mode."""

@@ -20,7 +20,7 @@ class Unreached(PathreplayError):
 
 @dataclass
 class RayDerivative:
-    """Derivative of an arrival: the adjoint q in reverse mode, the tangent in forward mode."""
+    """The derivative of a ray and of its density: the adjoint q in reverse mode, the tangent in forward mode."""
 
     o: mi.Point3f
     d: mi.Vector3f
@@ -28,7 +28,8 @@ class RayDerivative:
 
     @staticmethod
     def zero() -> RayDerivative:
-        # dr.zeros is not used here: it caches the field types of a class from the first variant that calls it.
+        # Not dr.zeros, which reads the field types of a class only once: it would use the types of the first variant in
+        # all later variants.
         return RayDerivative(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
 
     def finite_part(self) -> tuple[RayDerivative, mi.Bool]:
@@ -53,14 +54,14 @@ class NonFiniteCounter:
 
 
 def _attached_arrival(at: Arrival) -> Arrival:
-    """Copy an arrival, with ray and density as independent AD variables."""
+    """Copy an `Arrival`. The ray and the density of the copy are independent AD variables."""
     ray, pdf = _attached_ray(at.ray), mi.Float(dr.detach(at.pdf))
     dr.enable_grad(pdf)
     return replace(at, ray=ray, pdf=pdf)
 
 
 def _with_tangent(at: Arrival, tangent: RayDerivative) -> Arrival:
-    """Copy an arrival; ray and density have the given tangent."""
+    """Copy an `Arrival`. The ray and the density of the copy have the given tangent."""
     at = _attached_arrival(at)
     dr.set_grad(at.ray.o, tangent.o)
     dr.set_grad(at.ray.d, tangent.d)
@@ -80,9 +81,10 @@ def backward_step(
 ) -> tuple[mi.Spectrum, RayDerivative, mi.Bool]:
     """Back-propagate  δL β_i·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; return L_i, q_i and a mask.
 
-    ``L`` and ``q`` are L_{i+1} and q_{i+1}, the radiance along the next ray r_{i+1} and the adjoint of this ray. Unless
-    ``attached``, ray adjoints are zero and are not computed. The mask contains the lanes in which q_i was not finite
-    and was set to zero. With ``rays_only``, no parameter receives a gradient.
+    `Step` defines e_i and w_i, and β_i is the throughput before vertex i. ``L`` is L_{i+1}, the radiance along the next
+    ray r_{i+1}. ``q`` is q_{i+1}, the adjoint of the next ray. Unless ``attached``, ray adjoints are zero and are not
+    computed. The mask contains the lanes in which q_i was not finite and was set to zero. With ``rays_only``, no
+    parameter receives a gradient.
     """
     lost = mi.Bool(False)
     with dr.resume_grad():
@@ -104,7 +106,7 @@ def backward_step(
 def forward_step(
     trace: TraceConfig, v: VertexRecord, attached: bool, tangent: RayDerivative, active: mi.Bool
 ) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative]:
-    """Evaluate step i again; return the step, and the tangents of e_i, w_i and the next arrival."""
+    """Evaluate step i again. Return the step, and the tangents of e_i, of w_i and of the next ray."""
     with dr.resume_grad():
         at = _with_tangent(v.at, tangent) if attached else v.at
         step = repeat_step(trace, replace(v, at=at), attached, active)
@@ -141,7 +143,7 @@ def forward_splat(
     footprint: Callable[[mi.Point2f], F],
     active: mi.Bool,
 ) -> tuple[Step, SplatTangent[F], mi.Spectrum, RayDerivative]:
-    """Evaluate a step of a light path again; return it, and the tangents of splat, weight and next arrival."""
+    """Evaluate a step of a light path again. Return the step, its splat, and the tangents of weight and next ray."""
     with dr.resume_grad():
         at = _with_tangent(v.at, tangent) if attached else v.at
         step = repeat_step(trace, replace(v, at=at), attached, active)
@@ -192,7 +194,7 @@ def derivative_by_place(s: mi.Point2f, f: Callable[[mi.Point2f], mi.Float]) -> m
 
 
 def _attached_ray(ray: mi.Ray3f) -> mi.Ray3f:
-    """Copy a ray, with origin and direction as independent AD variables."""
+    """Copy a ray. The origin and the direction of the copy are independent AD variables."""
     ray = mi.Ray3f(ray)
     ray.o, ray.d = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d))
     dr.enable_grad(ray.o, ray.d)
@@ -204,7 +206,7 @@ def tangents(*values: Any) -> list[Any]:
     attached = [value for value in values if dr.grad_enabled(value)]
     if not attached:
         return [dr.zeros(type(value)) for value in values]
-    # Gradients of interior nodes must not be cleared, because some of the values are computed from others.
+    # Gradients of interior nodes must not be cleared: a value may be an interior node in the graph of another value.
     dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
     return [dr.grad(value) for value in values]
 
@@ -212,10 +214,11 @@ def tangents(*values: Any) -> list[Any]:
 def backward(target: mi.Float) -> None:
     """Back-propagate from a scalar per path.
 
-    Raises Unreached if the scalar depends on no parameter with gradients, because all gradients would silently be zero.
+    Raises Unreached if the scalar depends on no parameter with gradients. Without this error, all gradients would
+    silently be zero.
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):
-            return  # Dr.Jit evaluates each iteration of a loop: another iteration may have gradients.
+            return  # Dr.Jit runs each loop iteration separately, and a different iteration may have gradients.
         raise Unreached("no parameter with gradients reaches the light paths")
     dr.backward_from(target)

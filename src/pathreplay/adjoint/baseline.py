@@ -26,10 +26,11 @@ from pathreplay.transport.volume.media import interaction, majorant, span
 # the sums of the current pass. With more cells, each cell has fewer samples and gradients are noisier: see the cloud of
 # `pathreplay bench media`.
 CELLS, SIDES = 8, 4
-AVERAGES = 2 * CELLS**3 * SIDES**2  # X and Y side by side
+AVERAGES = 2 * CELLS**3 * SIDES**2  # the averages X and Y of each cell (see the module), side by side
 # Factor by which the previous sums are multiplied when a pass is added. About the last ten passes contribute.
 MEMORY = 0.9
-# Initial relative weight c of null collisions (see `branch_weight`): the value for fifty null collisions per path.
+# Initial relative weight c of null collisions (see `branch_weight`). `BaselineState.after` computes about this weight
+# if a path has fifty null collisions on average.
 FIRST_BRANCHING = 0.02
 # Null collisions are counted in this many partial sums, so that no sum is too large for float32.
 SLOTS = 256
@@ -44,10 +45,14 @@ def _channels() -> int:
 
 @dataclass(frozen=True)
 class BaselineCells:
-    """The cells of position and direction. The cells of position divide a box that contains all media."""
+    """The cells, by position and direction, in which radiance is averaged.
 
-    low: tuple[float, ...]  # Python values, constants for a frozen function
-    scale: tuple[float, ...]  # cells per unit of length
+    In space, the cells divide a box that contains all media. The fields are Python values, because a frozen function
+    treats Python values as constants.
+    """
+
+    low: tuple[float, ...]  # lower corner of the box
+    scale: tuple[float, ...]  # number of cells per unit of length, along each axis
 
     @staticmethod
     def of(box: mi.ScalarBoundingBox3f) -> BaselineCells:
@@ -55,7 +60,7 @@ class BaselineCells:
         return BaselineCells(tuple(map(float, box.min)), tuple(scale))
 
     def index(self, p: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
-        """Return the index of the average X of a cell; the average Y follows it."""
+        """Return the index of the average X of a cell (see the module). The average Y of this cell is the next one."""
         at = mi.Vector3u(
             dr.clip(mi.Vector3f(p - mi.ScalarPoint3f(self.low)) * mi.ScalarVector3f(self.scale), 0, CELLS - 1)
         )
@@ -72,14 +77,17 @@ class BaselineStats:
     """Sums of the radiance that gradient passes computed in media. Sums of several passes or shards can be added."""
 
     cells: BaselineCells
-    sums: mi.Float  # for each average, Σ weight·L in three channels and Σ weight
+    sums: mi.Float  # for each average X or Y of a cell: Σ weight·L in three channels, and Σ weight
     nulls: mi.Float  # partial sums of the numbers of null collisions, each small enough for float32
     paths: int  # number of paths that contribute to ``nulls``
     passes: frozenset[Hashable]  # keys of the passes
 
     @staticmethod
     def none(cells: BaselineCells, *keys: Hashable) -> BaselineStats:
-        """Create empty statistics for the passes with these keys; a recorded pass has no key."""
+        """Create empty statistics, to which passes with these ``keys`` will be added.
+
+        A pass recorded in a frozen function has no key.
+        """
         sums, nulls = dr.zeros(mi.Float, 4 * AVERAGES), dr.zeros(mi.Float, SLOTS)
         dr.make_opaque(sums, nulls)
         return BaselineStats(cells, sums, nulls, 0, frozenset(keys))
@@ -124,7 +132,7 @@ class Baseline:
     """
 
     cells: BaselineCells
-    known: mi.Float  # the averages
+    known: mi.Float  # the averages X and Y of all cells
     branching: mi.Float
 
     def lookup(self, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
@@ -139,7 +147,7 @@ class Baseline:
 
 @dataclass(frozen=True)
 class BaselineState:
-    """The learned state for the media of a scene; `after` returns the state after further passes."""
+    """State of the learned baseline for the media of a scene. `after` returns the state after further passes."""
 
     cells: BaselineCells
     sums: mi.Float  # like `BaselineStats.sums`, with smaller weights for older passes
@@ -157,7 +165,7 @@ class BaselineState:
         return BaselineState(BaselineCells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
 
     def after(self, seen: BaselineStats) -> BaselineState:
-        """Return the state updated with the statistics of passes; call this after their kernels were launched."""
+        """Return the state updated with the statistics of passes, whose kernels must already have been launched."""
         branching = seen.paths / (seen.paths + dr.sum(seen.nulls)) if seen.paths else self.branching
         sums, passes = MEMORY * self.sums + seen.sums, self.passes | seen.passes
         return BaselineState(self.cells, sums, branching, passes)
@@ -183,7 +191,7 @@ class BaselineState:
 
 
 def _averages(sums: mi.Float) -> mi.Float:
-    """Compute the averages from the sums; the mean over all cells dominates in cells with few samples."""
+    """Compute the averages X and Y of all cells. In a cell with few samples, the mean over all cells dominates."""
     i = dr.arange(mi.UInt32, AVERAGES)
     is_y = i % 2 == 1
     weight = dr.gather(mi.Float, sums, 4 * i + 3)

@@ -25,8 +25,8 @@ def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """Return whether only emitted radiance has gradients: no weight depends on a parameter, and nothing moves.
 
     One step is traced symbolically, which includes the virtual functions of all objects. With media, the result is
-    False. The result is also False if Dr.Jit evaluates virtual calls: a step from the first vertices then includes only
-    the objects at these vertices.
+    False. If Dr.Jit evaluates virtual calls, the step includes only the objects at the first vertices. The result is
+    then also False.
     """
     if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False

@@ -33,10 +33,10 @@ ILL_CONDITIONED = 1e-4
 class Recovery:
     """How the adjoint q_{i+1} of the next ray is recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i, in float64.
 
-    See `replay_attached` for A_i and p_i. The random number ε_i is +noise or -noise with equal probability. Among
-    distributions of standard deviation ``noise``, this one stays farthest from zero, where the matrix is singular. If
-    ``noise`` is 0, no noise is added. Where A_i is ill-conditioned, X_i is the identity on directions and zero on
-    origins. Elsewhere, X_i is zero.
+    See `replay_attached` for A_i and p_i. Where A_i is ill-conditioned, X_i is the identity on directions and zero on
+    origins. Elsewhere, X_i is zero. The random number ε_i is +noise or -noise with equal probability. At ε_i = 0, an
+    ill-conditioned matrix would stay singular. Among all distributions of ε_i with standard deviation ``noise``, this
+    distribution stays farthest from zero. If ``noise`` is 0, no noise is added.
     """
 
     noise: float = 0.01
@@ -46,18 +46,24 @@ class Recovery:
         return dr.float64_array_t(kind)  # type: ignore[no-any-return]
 
     def regularised(self, A: mi.Matrix4f, sign: mi.Float, smooth: mi.Bool) -> mi.Matrix4f:
-        """Return A + ε X. ``smooth`` marks the lanes in which a smooth lobe was sampled; only subclasses use it."""
+        """Return A + ε X.
+
+        ``smooth`` marks the lanes in which a smooth lobe was sampled. This class ignores the mask.
+        """
         ε = dr.select(independence(A) >= ILL_CONDITIONED, 0, type(A[0, 0])(self.noise * sign))
         return A + type(A)(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, ε, 0, 0, 0, 0, ε)
 
 
 @dataclass
 class RayFrame:
-    """Two axes s, t perpendicular to a ray. A nearby ray (o, d) has the coordinates (s·o/ℓ, t·o/ℓ, s·d, t·d)."""
+    """Two axes s, t perpendicular to a ray.
+
+    A nearby ray (o, d) has the coordinates (s·o/ℓ, t·o/ℓ, s·d, t·d), where ℓ is the unit of length.
+    """
 
     s: mi.Vector3f
     t: mi.Vector3f
-    scale: float  # ℓ, the unit of length
+    scale: float  # the unit of length ℓ
 
     @staticmethod
     def of(ray: mi.Ray3f, scale: float) -> RayFrame:
@@ -77,10 +83,13 @@ class RayFrame:
 
 @dataclass
 class Slope:
-    """Derivatives of δL·β e at a vertex with respect to two inputs besides the coordinates of the ray."""
+    """Derivatives of δL·β e, where e is the emission at a vertex, with respect to two properties of the arriving ray.
 
-    pdf: mi.Float  # density of the ray
-    slide: mi.Float  # distance by which the origin of the ray moves along the ray
+    The four coordinates of the ray do not contain these properties.
+    """
+
+    pdf: mi.Float  # derivative with respect to the density of the ray
+    slide: mi.Float  # derivative with respect to the distance by which the origin of the ray moves along the ray
 
 
 @dataclass
@@ -88,15 +97,15 @@ class Linearised:
     """A step linearised in the four coordinates of its ray."""
 
     A: mi.Matrix4f  # ∂r_{i+1}/∂r_i: derivative of the next ray's coordinates
-    e: mi.Vector4f  # derivative of δL·β_i e_i + (slope of e_{i+1})·(pdf, slide)
+    e: mi.Vector4f  # derivative of the first term of `local_terms`
     log_w: list[mi.Spectrum]  # derivative of log w_i with respect to each coordinate; 0 where w_i is 0
-    slope: Slope  # slope of e_{i+1}, at the next vertex
+    slope: Slope  # slope of the emission at the next vertex
     frame_next: RayFrame  # axes of the next ray
 
 
 @dataclass
 class PeeledPath:
-    """State of the second pass of attached replay, which starts with the L and q that the first pass has computed."""
+    """State of the second pass of attached replay. The pass starts with L and q as computed by the first pass."""
 
     δL: mi.Spectrum  # adjoint of the radiance of the path
     L: mi.Spectrum  # β_i L_i
@@ -117,7 +126,10 @@ def length_scale(scene: mi.Scene) -> float:
 
 
 def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
-    """Differentiate weight·e with respect to the inputs of `Slope`, at constant weight; e is the emission at ``at``."""
+    """Differentiate weight·e, where e is the emission at ``at``, with respect to the two ray properties of `Slope`.
+
+    The ``weight`` is a constant.
+    """
     if not has_smooth_lobes(trace):
         return Slope(mi.Float(0), mi.Float(0))
     slopes = []
@@ -144,11 +156,16 @@ def local_terms(
     frame_next: RayFrame,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Spectrum, list[mi.Float]]:
-    """Evaluate the step at ``v`` with a differentiable arrival; return three terms that both passes differentiate.
+    """Evaluate the step at ``v`` with the differentiable arrival ``at``; return three terms.
 
-    The first term is δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), with the inputs pdf and slide of `Slope`. The second
-    is w_i/detach(w_i), or 0 where w_i is 0. The third consists of the four coordinates of the next ray. ``weight`` is
-    δL β_i; ``slope`` is the slope of e_{i+1}.
+    Both passes of attached replay differentiate these terms:
+
+    - δL·β_i e_i, plus a linear approximation of the emission at the next vertex: `Slope.pdf` times the density of the
+      next ray, plus `Slope.slide` times the position of the next ray's origin along this ray
+    - w_i / detach(w_i), or 0 where w_i is 0
+    - the four coordinates of the next ray
+
+    ``weight`` is δL β_i. ``slope`` is the slope of the emission at the next vertex.
     """
     step = repeat_step(trace, replace(v, at=at), True, active)
     o, d = step.ray_next.o, step.ray_next.d
@@ -163,8 +180,8 @@ def linearise(
 ) -> Linearised:
     """Differentiate `local_terms` with respect to the four coordinates of the ray, and to nothing else.
 
-    ``onward`` is the path at the next vertex, and ``scale`` the unit of length. Both passes call this function, so that
-    their values agree to the last bit.
+    ``onward`` is the path at the next vertex, and ``scale`` the unit of length. Both passes of attached replay call
+    this function, so that the values of the two passes agree to the last bit.
     """
     slope = emission_slope(trace, onward.at, δL * onward.β, v.go_on)
     frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
@@ -198,7 +215,10 @@ def _unit_tangent(value: mi.Float | float) -> mi.Float:
 
 
 def random_sign(u: VertexSamples) -> mi.Float:
-    """Return +1 or -1 with equal probability, from a hash of the vertex's samples. Both passes get the same sign."""
+    """Return +1 or -1 with equal probability, from a hash of the vertex's samples.
+
+    Both passes of attached replay get the same sign.
+    """
     bits = [dr.reinterpret_array(mi.UInt32, x) for x in (u.light.x, u.roulette)]
     return dr.select((mi.sample_tea_32(bits[0], bits[1], 4)[0] & 1) == 0, mi.Float(1), mi.Float(-1))
 

@@ -58,11 +58,15 @@ def largest_record(trace: TraceConfig) -> int:
 
 def _bytes(layout: Layout) -> int:
     kinds = [_plain(kind) for _, kind, remembered in FIELDS if getattr(layout, remembered)]
-    return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # 4 for the word of bits
+    return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # 4 bytes for `BITS`
 
 
 def room_for(trace: TraceConfig) -> int:
-    """Return the number of records per path. With media, two null boundaries per vertex are expected (convex media)."""
+    """Return the number of records that are allocated per path.
+
+    With media, this number allows for two null boundaries per vertex: a ray crosses the boundary of a convex medium at
+    most twice.
+    """
     if trace.media is None:
         return device_of(mi.variant()).room(max(trace.max_depth, 1))
     return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)
@@ -82,7 +86,7 @@ class Layout:
     emissive: bool
     passes: bool
     branch: bool
-    splits: bool  # caustics are omitted
+    splits: bool  # the paths omit caustics: see `TraceConfig.without_caustics`
     always: bool = True  # condition of the fields that every record contains
 
     @property
@@ -103,8 +107,8 @@ class Layout:
         )
 
 
-# Each entry has a field of `VertexRecord`, its type in Mitsuba, and the property of `Layout` under which it is
-# recorded.
+# Each entry has a field of `VertexRecord`, the type of the field in Mitsuba, and a property of `Layout`. The field is
+# recorded if the property is true.
 FIELDS = (
     ("at.ray.o", "Point3f", "always"),
     ("at.ray.d", "Vector3f", "always"),
@@ -142,8 +146,8 @@ FIELDS = (
     ("kept.media.shadow.length", "Float", "media"),
 )
 
-# Dr.Jit's local memory does not support Bool. Each of these fields takes one bit of a word, whose upper bits contain
-# the lobe.
+# Dr.Jit's local memory does not support Bool. Each of these fields is therefore one bit of an integer. The upper bits
+# of the integer contain the BSDF component that was sampled.
 BITS = (
     ("at.hit.valid", "always"),
     ("at.delta", "varies"),
@@ -173,7 +177,7 @@ def _require_known(place: str, remembered: str) -> None:
         raise TypeError(f"Layout has no '{remembered}', on which '{place}' depends")
 
 
-for _place, *_, _remembered in (*FIELDS, *BITS):  # a name that no longer exists is reported on import
+for _place, *_, _remembered in (*FIELDS, *BITS):  # an entry that names no existing field raises an error on import
     _require_known(_place, _remembered)
 
 

@@ -38,10 +38,12 @@ def replay(
 
     Returns whether the path moves with the parameters. If the path moves, ``recovery`` describes how ray adjoints are
     recovered, and ``lost`` counts the paths with a non-finite ray adjoint. If paths move in a scene with smooth lobes,
-    a warning is logged once. Not differentiated: visibility, weights that are exactly zero (in contrast to the sweep
-    driver) and, with ``attach='none'``, all motion. Raises PathreplayError if a path moves in a scene with media.
+    a warning is logged once. Not differentiated: visibility and, with ``attach='none'``, all motion. Weights that are
+    exactly zero are not differentiated either; the sweep driver differentiates such weights. Raises PathreplayError if
+    a path moves in a scene with media.
     """
-    # With null branching, zero weights do not end paths. The branch then has the same samples as in other drivers.
+    # With null branching, paths continue after a zero weight, as in the sweep driver. The extra path of null branching
+    # then has the same random numbers in both drivers.
     path = PathState.begin(trace, start, sustained=trace.branch)
     moves = path_moves(trace, start, path.at)
     if not moves:
@@ -74,7 +76,7 @@ def _replay_still(trace: TraceConfig, start: CameraStart, path: PathState, δL: 
     """Replay a path that does not move with the parameters.
 
     At each vertex, β_{i+1} L_{i+1} = β_i L_i - β_i e_i is known. A change dw_i of the weight changes the radiance by
-    this value times dw_i / w_i.
+    β_{i+1} L_{i+1} dw_i / w_i.
     """
     sampler, ray0 = start.sampler, path.at.ray
     L = path_radiance(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, updated at each vertex

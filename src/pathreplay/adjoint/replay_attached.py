@@ -60,7 +60,7 @@ def _tangents(
 ) -> tuple[mi.Spectrum, mi.Vector4f]:
     """Run the first pass: compute L_0 and q_0 = δL·∂L_0/∂r_0."""
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
-    L = Spectrum(0)  # without the factor δL
+    L = Spectrum(0)  # radiance so far, without the factor δL
     q = Vector(0)
     J = Matrix(1)  # Jacobian ∂r_i/∂r_0 of the ray that arrives at vertex i
     κ = [Spectrum(0) for _ in range(4)]  # ∂ log β_i / ∂r_0, one spectrum for each of the four coordinates of r_0
@@ -90,7 +90,7 @@ def _peel(
     recovery: Recovery,
     scale: float,
 ) -> None:
-    """Run the second pass: peel L and q, and back-propagate into the parameters."""
+    """Run the second pass: compute L and q of each ray in turn, and back-propagate into the parameters."""
     δL, L, q, overflow = peeled.δL, peeled.L, peeled.q, peeled.overflow
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
     broken = mi.Bool(False)  # this path has been counted as lost

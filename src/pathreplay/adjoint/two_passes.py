@@ -36,7 +36,7 @@ def record_path(
     All lanes of a packet must write to the same index. Otherwise writes to local memory are lost (Dr.Jit 1.5).
     """
     trace = replace(trace, background_apart=layout.fixed)
-    L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance so far
+    L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance of the path so far; radiance from the environment
     count = mi.UInt32(0)  # number of vertices and null boundaries
     branch, left = Branch.none(), mi.Bool(False)
     if dr.hint(trace.background_apart, mode="scalar"):

@@ -1,17 +1,17 @@
 """Arcs of directions around a vertex, on which edges between surfaces are searched: see `crofton`.
 
 An arc contains a BSDF sample d, drawn with density p. If d were always the centre of the arc, the variance would be
-practically unbounded for lobes that are narrower than the arc. An arc whose sample lies beside the lobe has a low
-density p, but may contain the peak, at which the BSDF is many thousand times p. The sample d therefore lies at one of n
-positions d_i of the arc, selected at random. The density of the arc is the mean of p(d_i), which accounts for all lobes
-that are wider than the spacing of the d_i. Narrower lobes need shorter arcs. The length l_j is selected with
-probability P_j(p), and a crossing in direction z has the weight
+practically unbounded for lobes that are narrower than the arc: beside a lobe, p is low, but the arc may contain the
+peak of the lobe, at which the BSDF is many thousand times p. The sample d therefore lies at one of n positions d_i of
+the arc, selected at random. The density of the arc is the mean of p(d_i). This mean accounts for all lobes that are
+wider than the spacing of the d_i. Narrower lobes need shorter arcs. The length l_j is selected with probability P_j(p).
+An edge that crosses the arc in direction z has the weight
 
     a_j(z) / (l_j · mean p(d_i) P_j(p(d_i))),        a_j ∝ l_j P_j min(1, p_j / p(z)),        Σ_j a_j = 1,
 
 where p_j is the largest density for which arcs of length l_j are short enough. The expectation, summed over all
-lengths, is correct for any a_j with sum 1. It is also correct for every position of d on the arc, because rotation
-along a great circle preserves the measure of arcs.
+lengths, is correct for any a_j with sum 1. The expectation is also correct for every position of d on the arc, because
+rotation along a great circle preserves the measure of arcs.
 """
 
 from __future__ import annotations
@@ -104,7 +104,10 @@ class Arc:
         return total
 
     def importance(self) -> mi.Float:
-        """Estimate the weight of a crossing, relative to its weight if all arcs had the largest length."""
+        """Estimate the ratio of two weights of a crossing.
+
+        The first weight is the actual weight. The second is the weight if all arcs had the largest length.
+        """
         return mi.Float(1) if self.j is None else _suitability(self.p, self.j) / _normalization(self.p)
 
 
@@ -141,11 +144,14 @@ def _length(j: mi.UInt32) -> mi.Float:
 
 
 def _suitability(p: mi.Float, j: mi.UInt32) -> mi.Float:
-    """Return the factor min(1, p_j / p) of a_j, which is small for arcs that are too long; 1 for the shortest arcs."""
+    """Return the factor min(1, p_j / p) of a_j. The factor is small for arcs that are too long.
+
+    For the shortest arcs, the factor is 1.
+    """
     return dr.select(j == LENGTHS - 1, 1, dr.minimum(1, BROAD * dr.exp2(4 * mi.Float(j)) / p))
 
 
 def _normalization(p: mi.Float) -> mi.Float:
-    """Return Σ_j l_j P_j min(1, p_j / p), by which all a_j are divided, relative to the largest length."""
+    """Return Σ_j l_j P_j min(1, p_j / p), the divisor of all a_j, for lengths l_j relative to the largest length."""
     levels = map(mi.UInt32, range(LENGTHS))
     return sum((_length(j) * probability(p, j) * _suitability(p, j) for j in levels), mi.Float(0))

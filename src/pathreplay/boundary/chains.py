@@ -166,7 +166,7 @@ def record_chain(
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
     count = mi.UInt32(0)
     while dr.hint(path.active & (count <= k), exclude=[trace, layout], label="pathreplay: record chain"):
-        path.active &= count < k  # The path ends at the last record, of which only the arrival is read.
+        path.active &= count < k  # The path ends at record k. Only the `Arrival` in this record is read later.
         u, step = path.choose(trace, sampler)
         onward, v = path.advance(trace, u, step)
         records[count] = record(layout, v)

@@ -70,12 +70,12 @@ class Crease:
 
 
 def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> list[Arrival]:
-    """Return the arrivals on two sides of an edge, moved apart where two surfaces form a concave corner.
+    """Return the arrivals on the two sides of an edge, moved apart where two surfaces form a concave corner.
 
-    Ray origins are offset from their surface. If a hit is closer to a contact line than this offset, the ray origin
-    lies behind the other surface. Rays from below a floor, for example, would reach the sky. Radiance is continuous
-    along each surface. The error of moving the hits is therefore proportional to the distance by which they move, some
-    thousandths of the size of objects.
+    The origin of a ray is offset from the surface on which the ray starts. If a hit is closer to a contact line than
+    this offset, the origin of the next ray lies behind the other surface. Rays from below a floor, for example, would
+    reach the sky. Radiance is continuous along each surface. The error of moving the hits is therefore proportional to
+    the distance by which the hits move. This distance is some thousandths of the size of objects.
     """
     sides = [(at, at.hit.compute_surface_interaction(at.ray, compat.minimal(), active)) for at in (a, b)]
     normals = [dr.select(dr.dot(si.n, at.ray.d) > 0, -si.n, si.n) for at, si in sides]
@@ -93,7 +93,10 @@ def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> 
 
 
 def _towards(trace: TraceConfig, at: Arrival, p: mi.Point3f, short: mi.Float, active: mi.Bool) -> Arrival:
-    """Move an arrival to the nearby point ``p``, if a ray that starts ``short`` before p hits the same surface."""
+    """Move an arrival to the nearby point ``p``, if a ray towards ``p`` hits the same surface as before.
+
+    The ray starts at the distance ``short`` before ``p``.
+    """
     ray, to_p = mi.Ray3f(at.ray), p - at.ray.o
     ray.d = dr.normalize(to_p)
     offset = dr.maximum(dr.norm(to_p) - short, 0)

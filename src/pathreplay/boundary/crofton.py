@@ -6,8 +6,8 @@ crossings with edges is 2 l / π times the integral of g along the edges. Differ
 surfaces) at the ends of a segment indicate a crossing; bisection locates it.
 
 If a segment has two crossings, for example at a corner, the signatures at its ends may be equal. Each segment is
-therefore also probed in the middle. Two crossings on the same side of the middle are still missed. In compensation,
-segments that differ only in the middle have a larger weight: see `middle_weight`.
+therefore also probed in the middle. Two crossings on the same side of the middle are still missed. In compensation, a
+segment has a larger weight if its ends have equal signatures and only its middle differs: see `middle_weight`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class VisibilityProbe:
     near: mi.Float = field(default_factory=lambda: mi.Float(1))  # reciprocal distance of the visible point
     bright: mi.Float = field(default_factory=lambda: mi.Float(1))  # estimate of the radiance
     # For coarse meshes with smooth shading, where the plane of a triangle may occlude light:
-    triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 1 + triangle index; 0: irrelevant
+    triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 1 + index of the visible triangle; 0: none
     light: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the emitter sample, or zero
     lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the BSDF sample, or zero
 
@@ -138,7 +138,10 @@ class Bracket:
     weight: mi.Float  # number of crossings that the interval represents; 0: no edge
 
     def per_length(self, length: mi.Float | float, density: mi.Float) -> mi.Float:
-        """Return the Crofton weight: the number of crossings times π/2 / (l p(c)), the length of edge per crossing."""
+        """Return the Crofton weight, the number of crossings times π/2 / (l p(c)).
+
+        The factor π/2 / (l p(c)) is the length of edge per crossing.
+        """
         return 0.5 * dr.pi * self.weight / (length * density)
 
 
@@ -162,8 +165,8 @@ class Survey:
         """Summarise the probes at `probe_positions`."""
         a, b, c = probes
         ends, halves = a.edge_importance(b), dr.maximum(c.edge_importance(a), c.edge_importance(b))
-        # If only the middle differs, the weight is about 4: a factor of 2 because one of two crossings is selected, and
-        # a factor of about 2 from `middle_weight`.
+        # If the probes at the ends are equal and only the probe in the middle differs, the weight is about 4. A factor
+        # of 2 arises because `bisect` selects one of two crossings. `middle_weight` is another factor of about 2.
         presence = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
         near = dr.maximum(dr.maximum(a.near, b.near), c.near)
         bright = dr.maximum(dr.maximum(a.bright, b.bright), c.bright)
@@ -181,13 +184,14 @@ def detect(probe: Probe, length: mi.Float, active: mi.Bool) -> mi.Float:
 
 
 def middle_weight(m: mi.Float) -> mi.Float:
-    """Return the weight of a segment that has equal probes at its ends and other probes on a part around its middle.
+    """Return the weight of a segment whose ends have equal probes, and whose probes differ on a part around its middle.
 
-    The part has the fraction ``m`` of the segment's length. Suppose that the segment is shifted along its own line,
-    with shifts measured in units of its length. The segment contains the whole part over a range of shifts of size
-    1 - m. The part is detected only if it also contains the middle of the segment. This range has the size
-    min(m, 1 - m). The weight is the ratio of the two sizes, which is unbounded for small m. Below `MIN_FRACTION`, the
-    weight is therefore constant. Its value gives the correct expectation at corners, where all m are equally likely.
+    ``m`` is the length of this part, divided by the length of the segment. Suppose that the segment is shifted along
+    its own line, and that shifts are measured in lengths of the segment. In a range of shifts of size 1 - m, the
+    segment contains the whole part. The part is detected only if the middle of the segment also lies in the part, which
+    holds in a range of size min(m, 1 - m). The weight is the ratio of the two sizes, which is unbounded for small m.
+    Below `MIN_FRACTION`, the weight is therefore constant. The constant gives the correct expectation at corners, where
+    all m are equally likely.
     """
     return dr.select(m < MIN_FRACTION, 2 / MIN_FRACTION - 1, dr.select(m < 0.5, (1 - m) / m, 1))
 
@@ -196,10 +200,11 @@ def middle_weight(m: mi.Float) -> mi.Float:
 def middle_fraction(
     probe: Probe, length: mi.Float, at_a: VisibilityProbe, at_b: VisibilityProbe, active: mi.Bool
 ) -> mi.Float:
-    """Return the fraction of a segment, around its middle, that differs from its ends.
+    """Return the length of the part around the middle of a segment that differs from the ends of the segment.
 
-    The error in each half is at most 1/16. A position belongs to this part if its probe differs from the probe at an
-    end. The part may contain further edges.
+    A position belongs to the part if its probe differs from the probe at one of the ends. The part may contain further
+    edges. The result is a fraction of the length of the segment. In each half of the segment, the error is at most 1/16
+    of this half.
     """
     half = 0.5 * length
     n, fraction, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
@@ -221,9 +226,10 @@ def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32
     """Bisect each segment of non-zero ``weight`` to an interval with an edge, 2^-12 as long as the segment.
 
     If a segment has several crossings, one is selected with a probability proportional to its importance, and the
-    weight is divided by this probability. If only the middle differs, `middle_weight` applies. The weight becomes 0
-    where a surface is merely curved, and at cracks between triangles, through which few rays pass. A crack is assumed
-    if one end of the interval stays fixed, and a probe just beyond this end equals the probe at the other end.
+    weight is divided by this probability. If the ends of a segment have equal probes, the weight is multiplied by
+    `middle_weight`. The weight becomes 0 where a surface is merely curved, and at cracks between triangles, through
+    which few rays pass. A crack is assumed if one end of the interval stays fixed, and a probe just beyond this end
+    equals the probe at the other end.
     """
     a, b, _ = probe_positions(length)
     weight = mi.Float(weight)

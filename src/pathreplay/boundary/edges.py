@@ -58,7 +58,7 @@ class FilmDomain(Protocol):
         """
 
     def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
-        """Project a point onto the film: return its position, and whether the projection exists and is supported."""
+        """Project a point onto the film; return the film position, and whether the sensor can project and see it."""
 
 
 class Crossing(Protocol):
@@ -80,10 +80,10 @@ class EdgePath:
 
     s: mi.Point2f  # film position
     key: mi.UInt32  # seed of the path's random numbers
-    k: mi.UInt32  # zero without an edge
+    k: mi.UInt32  # number of vertices; zero without an edge
     ray: mi.Ray3f
     layout: Layout
-    records: Any  # k vertices, and the arrival at the observer or at the edge
+    records: Any  # records of the k vertices, and of the arrival at the observer or at the edge
 
 
 @dataclass

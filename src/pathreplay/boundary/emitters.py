@@ -123,7 +123,7 @@ def direction(emitter: SampledEmitter, o: mi.Point3f, u: mi.Point2f) -> tuple[mi
 
 @dataclass
 class EmitterSegment(PlaneSegment):
-    """A segment in the unit square of one emitter (see `emitters`), reflected at the margin."""
+    """A segment in the unit square of one emitter (see `emitters`), reflected where it meets the margin."""
 
     observer: ObserverVertex
     key: mi.UInt32
@@ -183,7 +183,8 @@ class EmitterSegment(PlaneSegment):
     def followed(self, origin: mi.Interaction3f, u: mi.Point2f, anchor: EmitterProbe, active: mi.Bool) -> mi.Vector3f:
         """Return the direction to position ``u`` of the emitter, differentiable in ``u``, origin and emitter.
 
-        On a mesh emitter, the direction moves with the origin and the point that the ray of ``anchor`` hit.
+        The ray of ``anchor`` has hit a point of the emitter. If the emitter is a mesh, the direction moves like the
+        direction from the origin to this point.
         """
         trace, emitter = self.observer.trace, self.emitter
         in_cone = active & (emitter.radius > 0)
@@ -205,7 +206,10 @@ class EmitterSegment(PlaneSegment):
         return VisibilityProbe.of(sample.hidden & moving)
 
     def detect(self) -> Importance:
-        """Estimate the importance of an edge. Without narrow lobes, scattering is evaluated only in the middle."""
+        """Estimate the importance of an edge.
+
+        In scenes without narrow lobes, scattering is evaluated only in the middle of the segment.
+        """
         trace, x, active = self.observer.trace, self.observer.selected, self.observer.active
         samples = [self.probe_emitter(t, active) for t in probe_positions(self.length)]
         a, b, c = (sample.light.d for sample in samples)

@@ -32,8 +32,8 @@ class ShadowTest:
     ray: mi.Ray3f  # towards the light
     hit: mi.PreliminaryIntersection3f
     outside: mi.Bool  # the point is outside a projector's image, or a cone without falloff
-    uv: mi.Point2f  # position in the image
-    met: mi.PreliminaryIntersection3f | None = None  # hit of the point; None for a point in a medium
+    uv: mi.Point2f  # position in the projector's image
+    met: mi.PreliminaryIntersection3f | None = None  # surface hit at the tested point; None for a point in a medium
 
     @staticmethod
     def of(trace: TraceConfig, at: Arrival, sampler: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:

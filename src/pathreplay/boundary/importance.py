@@ -1,8 +1,8 @@
 """Importance of a segment, estimated from its probes: it determines which segments are bisected, but adds no bias.
 
-The direction to an edge at distance r turns by 1 / r per unit of motion, and the integrand jumps at the edge by a
-fraction of the scattered radiance. The radiance of a visible surface is unknown before a path is traced. It is
-therefore replaced by a factor, which is 1 for the sky and `DIM` for any surface.
+The contribution of an edge has two factors. The direction to an edge at distance r turns by 1 / r per unit of motion.
+At the edge, the integrand jumps by a fraction of the scattered radiance. The radiance of a visible surface is unknown
+before a path is traced. The importance therefore contains a constant instead: 1 for the sky, and `DIM` for any surface.
 """
 
 from __future__ import annotations
@@ -34,13 +34,16 @@ subtends, to bound the importance of small emitters."""
 class Importance:
     """Importance of a segment."""
 
-    presence: mi.Float  # see `Survey`
+    presence: mi.Float  # see `Survey.presence`
     edges: mi.Float  # importance of the edges
     light: mi.Float  # scattered radiance of an emitter sample, or scattering weight of an arc
 
     @staticmethod
     def of(survey: Survey, light: mi.Float, scale: mi.Float) -> Importance:
-        """Compute the importance from a survey and all other factors (``scale``). Non-finite values become zero."""
+        """Compute the importance from a survey. Non-finite values become zero.
+
+        ``scale`` is the product of all factors of the importance that the survey does not contain.
+        """
         edges = survey.presence * survey.near * survey.bright * scale
         return Importance(_finite(survey.presence), _finite(edges), _finite(light))
 
@@ -62,13 +65,19 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
 
 
 def radiance_of(importances: list[Importance]) -> mi.Float:
-    """Estimate the mean radiance along arcs: scattered radiance of emitter samples divided by scattering weight."""
+    """Estimate the mean radiance along arcs.
+
+    The estimate is the scattered radiance of all emitter samples, divided by the scattering weight of all arcs.
+    """
     from_emitters, total = (dr.sum(importance.light) for importance in importances)
     return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
 
 
 def weighed(importances: list[Importance], radiance: mi.Float) -> list[mi.Float]:
-    """Return presence and importance of edges as two arrays with sum 1. Segments in emitter squares precede arcs."""
+    """Return the presence and the importance of edges as two arrays. Each of the two arrays has the sum 1.
+
+    In both arrays, the segments in emitter squares precede the arcs.
+    """
     in_squares, on_arcs = importances
     presence = dr.concat([in_squares.presence, on_arcs.presence])
     importance = dr.concat([in_squares.edges, radiance * on_arcs.edges])

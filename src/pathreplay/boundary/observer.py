@@ -33,7 +33,10 @@ NEAR = 10.0
 
 
 def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool, mi.Spectrum]:
-    """Return the lanes whose vertex has a smooth lobe or is in a medium, and the weight of the flight (Spectrum)."""
+    """Return the lanes whose vertex has a smooth lobe or is in a medium, and a weight (Spectrum).
+
+    The weight is the `Flight.weight` of the flight to the vertex.
+    """
     if trace.media is None:
         return surface_sees(trace, at), mi.Spectrum(1)
     flight = step.kept.media.flight
@@ -125,7 +128,7 @@ class ObserverVertex:
             # With a given flight, no random numbers are needed, and the sampler may be None.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # where True, creases are edges
+        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # in these lanes, creases are edges
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
         """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium: see `fly_again`."""
@@ -196,7 +199,7 @@ class ObserverVertex:
         return meet(self.trace, ray, active)
 
     def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-        """Return the first hit of a ray that is not a null boundary; ``hit`` is the first hit of any kind."""
+        """Return a ray's first hit on a surface that is not a null boundary; ``hit`` is the first on any surface."""
         return hit if self.trace.media is None else skip_null(self.trace, ray, hit, active)
 
     def edge_surfaces(
@@ -265,7 +268,7 @@ class ObserverVertex:
 
 
 def arrival_beyond(trace: TraceConfig, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
-    """Return the arrival of the ray that continues the ray of ``at`` from distance ``t`` on, inside ``medium``."""
+    """Continue the ray of ``at`` from distance ``t`` on, inside ``medium``; return the `Arrival` at the next hit."""
     ray = further(at.ray, t)
     hit = meet(trace, ray, active)
     if trace.hide_emitters:

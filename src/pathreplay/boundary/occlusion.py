@@ -188,13 +188,16 @@ class OcclusionEdge:
 
 @dataclass
 class HeldEdge:
-    """The motion V_edge of the direction to an edge, which follows a point of the near surface. See `Crossing`."""
+    """The motion V_edge of the direction to an edge. This direction follows a point of the near surface.
+
+    The class implements `Crossing`.
+    """
 
     weight: mi.Spectrum
     edge: OcclusionEdge
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """Evaluate B = n·d for the direction d to the edge. Its derivative is n·V_edge. B is 0 at a crease."""
+        """Evaluate B = n·d for the direction d to the edge. The derivative of B is n·V_edge. At a crease, B is 0."""
         e = self.edge
         d = held_direction(at, e.near.ray.d, e.near.edge, e.active)
         return dr.select(e.active & ~e.is_crease, dr.dot(e.n, d), 0)
@@ -202,14 +205,17 @@ class HeldEdge:
 
 @dataclass
 class MovedSide:
-    """The motion V of sampled directions on one side of an edge. It is the same as in the interior term."""
+    """The motion V of sampled directions on one side of an edge. V is the same as in the interior term."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge
     side: Side
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """Evaluate B = n·d, whose derivative is n·V. At a crease, evaluate B of the crease, divided by its slope."""
+        """Evaluate B = n·d, whose derivative is n·V.
+
+        At a crease, B is `OcclusionEdge.crease_gap` divided by `OcclusionEdge.slope`.
+        """
         e, hit, lengths = self.edge, self.side.hit, self.edge.observer.trace.traits.tables.blend_lengths
         d, _ = moved_direction(lengths, at, self.side.ray.d, hit, e.observer.holds(hit, e.active))
         ray = mi.Ray3f(at.spawn_ray(dr.detach(d)).o, d)

@@ -117,8 +117,8 @@ class PrimarySearch(FilmSearch[FilmSegment]):
     def _jump(self, split: ChainSplit, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """Estimate f_a - f_b with the same random numbers on both sides. ``ray`` is the camera ray of side a."""
         trace = self.trace
-        # On coarse meshes, the plane of a triangle cuts off part of the lobes. With steady frames, this is the only
-        # difference between the two sides of a crease.
+        # On coarse meshes, the plane of a triangle cuts off part of the lobes. If `steady` makes the shading frames
+        # continuous across triangles, this cut-off is the only difference between the two sides of a crease.
         onward = replace(trace, steady_frames=trace.traits.coarse_meshes and not trace.traits.brushed_meshes)
         sides, T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:

@@ -1,4 +1,4 @@
-"""Edge search, common to all domains: draw segments, detect edges, resample, bisect, weigh and record.
+"""Edge search, shared by all boundary terms: draw segments, detect edges, resample, bisect, weigh and record.
 
 Most segments cross no edge. A first kernel therefore probes all segments. Segments are then resampled by importance,
 and a second kernel bisects a fixed number of segments. No lane of the second kernel is wasted, and its width is the
@@ -35,7 +35,7 @@ Segments = TypeVar("Segments")
 
 @dataclass(frozen=True)
 class EdgeSearch(ABC, Generic[Segments]):
-    """Template of an edge search. A subclass per domain defines segments, edge detection, and weights of edges."""
+    """Template of an edge search. Each subclass defines its segments, edge detection, and weights of edges."""
 
     trace: TraceConfig
     film: FilmDomain
@@ -48,7 +48,7 @@ class EdgeSearch(ABC, Generic[Segments]):
         search = self.guided(n, seed)
         importance = search.detect(search.draw(dr.arange(mi.UInt32, n), n, seed))
         chosen = Resampled.of(importance, resolved, seed)
-        weight = chosen.weight * dr.opaque(mi.Float, 1 / n)  # an opaque n gives one kernel for all values
+        weight = chosen.weight * dr.opaque(mi.Float, 1 / n)  # opaque, so that all values of n share one kernel
         generator = mi.PCG32(resolved, initstate=seed + int(self.bisection), initseq=dr.arange(mi.UInt32, resolved))
         return search.resolve(search.draw(chosen.index, n, seed), weight, generator)
 

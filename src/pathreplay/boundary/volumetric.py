@@ -116,11 +116,14 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         return T * observer.selected.β * observer.towards(lit_test.ray.d, active)[0] * lit_test.Le
 
     def _hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-        """Return the first hit of a ray that is not a null boundary."""
+        """Return the first hit of a ray on a surface that is not a null boundary."""
         return skip_null(self.trace, ray, meet(self.trace, ray, active), active)
 
     def _reach(self, ray: mi.Ray3f) -> mi.Float:
-        """Return the largest τ that is sampled on a ray: at its hit or, on a miss, behind the whole scene."""
+        """Return the largest distance τ that is sampled along a ray.
+
+        If the ray hits a surface, the result is the distance of the hit. Otherwise, the result lies behind the scene.
+        """
         hit, box = self._hit(ray, mi.Bool(True)), self.trace.scene.bbox()
         far = dr.norm(ray.o - box.center()) + 0.5 * dr.norm(box.extents())
         return dr.select(hit.is_valid(), hit.t, far)

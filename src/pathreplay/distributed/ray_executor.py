@@ -137,8 +137,8 @@ class WorkerPool:
     def fetch(self, call: _Call, reference: Reference) -> list[Answer] | None:
         """Return one answer per shard of a request. Raises the error of an evaluation that failed.
 
-        Returns None if the actor was lost, or if the request was to build its problem. Raises PathreplayError if no
-        actor is left.
+        Returns None if the actor was lost, or if the request asked the actor to build the problem. Raises
+        PathreplayError if no actor is left.
         """
         try:
             answer = self.ray.get(reference)  # does not block: the answer exists, or its actor is lost
@@ -194,7 +194,7 @@ class WorkerPool:
         self._initialize(number)
 
     def log_once(self, line: str) -> None:
-        """Log a line unless the same line was logged before, because several actors may cause it."""
+        """Log a line unless the same line was logged before. Several actors may cause the same line."""
         if line not in self.logged:
             self.logged.add(line)
             self.tell(line)

@@ -73,7 +73,7 @@ class Scheduler:
     """Per actor that took no shard of the busiest owner in this step: the remaining seconds of the owner's work."""
 
     def begin(self) -> None:
-        """Begin a step: add the seconds in ``refused``, from the previous step, to ``waited``."""
+        """Begin a step: add the seconds in ``refused``, which the previous step has collected, to ``waited``."""
         for actor, seconds in self.refused.items():
             self.waited[actor] = self.waited.get(actor, 0.0) + seconds
         self.refused.clear()
@@ -232,7 +232,8 @@ class Step:
     def lost(self, index: int, actor: Actor) -> None:
         """Mark a shard as waiting because its actor was lost, unless it is done or another actor is evaluating it.
 
-        The lost actor's waiting shards are reassigned by kind. Usually, their kinds now have no owner; see `forget`.
+        The waiting shards of the lost actor are reassigned to the owners of their kinds. Usually, these kinds have no
+        owner any more, because `Scheduler.forget` has removed the lost actor as their owner.
         """
         self.heard(index, actor)
         self.left.pop(actor, None)

@@ -42,8 +42,9 @@ INNER_LENGTHS = 0.25, 0.1  # length of segments in the unit square of emitter sa
 class Boundary:
     """The boundary term, for edges visible from the camera, from surfaces or from points in media.
 
-    The camera may see an edge directly, in mirrors or through glass. Not differentiated: edges in textures and masks;
-    alpha; in scenes with media, hard shadows after the first scattering vertex.
+    The camera may see an edge directly, in mirrors or through glass. Edges in textures and masks are not
+    differentiated, and neither is the alpha channel. In scenes with media, hard shadows after the first scattering
+    vertex are not differentiated.
     """
 
     film: bool = True  # edges visible from the camera
@@ -127,7 +128,10 @@ class Boundary:
 
 
 def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
-    """Return the number of boundary segments of a pass: ``spp`` per pixel (0: as many as samples)."""
+    """Return the number of boundary segments of a pass: ``spp`` per pixel.
+
+    If ``spp`` is 0, there are as many segments per pixel as samples per pixel.
+    """
     pixels = int(places.size.x) * int(places.size.y)
     n = pixels * (math.ceil(spp * view.share) if spp else view.spp)
     if n > MOST_SAMPLES:
@@ -141,7 +145,8 @@ def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
     """Return the sensors that count as static.
 
-    The sensor of the pass counts as static only with a film flow: `FilmDomain.flows` then marks the rays that move.
+    The sensors that the pass does not use count as static. The sensor of the pass counts as static only if the pass has
+    a film flow, because `FilmDomain.flows` then marks the rays that move.
     """
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 

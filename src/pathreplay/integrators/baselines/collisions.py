@@ -46,7 +46,7 @@ def differentiate_shadow(
         σ_bar = majorant(stretch.medium, stretch.ray, inside)
         tracked = inside & (σ_bar > 0)
         if dr.hint(trace.media.homogeneous, mode="scalar"):
-            tracked &= ~stretch.medium.is_homogeneous()  # closed form, without tracking
+            tracked &= ~stretch.medium.is_homogeneous()  # homogeneous media have a closed form, which needs no tracking
         t = mi.Float(a)
         while dr.hint(tracked, label="pathreplay: listing, ratio tracking"):
             t -= dr.log(1 - past.next_1d(tracked)) / σ_bar

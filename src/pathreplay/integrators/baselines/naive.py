@@ -26,7 +26,7 @@ def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost
     """Back-propagate the adjoint radiance ``δL`` into the parameters and the ``start``; return whether paths move.
 
     Uses the same estimator as `sweep`: equal random numbers give equal gradients. Not differentiated: see `tape`.
-    Raises PathreplayError if no parameter reaches the paths.
+    Raises PathreplayError if the paths depend on no parameter with gradients.
     """
     with dr.resume_grad(), dr.isolate_grad():
         L, _, moves = tape(trace, start)

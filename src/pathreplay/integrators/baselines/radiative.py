@@ -32,11 +32,11 @@ def radiative(
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
-    ``linear`` selects a biased variant in linear time. As in the biased variants of the paper, the incident radiance is
-    left out: wherever a path continues, L_{i+1} is replaced by one in all channels. Emission and next-event estimation
-    (e_i) are unchanged. The magnitude of the gradient is then wrong and, in dark media, its sign may also be wrong. The
-    counter ``lost`` is not used. Not differentiated: visibility and, as with ``attach='none'``, all motion. Raises
-    PathreplayError if no parameter reaches the paths.
+    ``linear`` selects a biased variant in linear time. As in the biased variants of Nimier-David et al. (2020), the
+    incident radiance is left out: wherever a path continues, L_{i+1} is replaced by one in all channels. Emission and
+    next-event estimation (e_i) are unchanged. The magnitude of the gradient is then wrong and, in dark media, its sign
+    may also be wrong. The counter ``lost`` is not used. Not differentiated: visibility and, as with ``attach='none'``,
+    all motion. Raises PathreplayError if the paths depend on no parameter with gradients.
     """
     sampler, path = start.sampler, PathState.begin(trace, start)
 
