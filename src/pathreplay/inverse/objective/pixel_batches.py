@@ -50,7 +50,7 @@ def obstacle(problem: Problem, integrator: StatefulIntegrator, sensor: int, spp:
     ``some`` selects a pass over a batch of pixels instead of all pixels.
     """
     if problem.loss not in QUADRATIC:
-        return "its loss is neither l2 nor relative-l2; use one of these"
+        return "its loss is none of l2, relative-l2 and display-l2; use one of these"
     return integrator.why_no_pixel_sweep(problem.scene, problem.scene.sensors()[sensor], spp, some)
 
 
