@@ -97,7 +97,10 @@ def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi
 
 
 def sample_at(trace: TraceConfig, emitter: SampledEmitter, u: mi.Point2f) -> mi.Point2f:
-    """Return an emitter's random numbers at a position of the square; for a sphere, through an equal-area disk map."""
+    """Return the random numbers for which the emitter is sampled at the position u of the unit square.
+
+    They are u itself, except for spheres: there, an equal-area map from the square to the disk is applied to u.
+    """
     if not trace.traits.sphere_lights:
         return u
     p = mi.warp.square_to_uniform_disk_concentric(u)

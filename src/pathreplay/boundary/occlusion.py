@@ -92,7 +92,7 @@ class ArcSegment(Arc):
         return ShadowTest.of(self.observer.trace, arrival, sampler, depth + 1, active)
 
     def detect(self) -> Importance:
-        """Estimate the importance of an edge on the arc."""
+        """Estimate the importance of an edge that crosses this arc."""
         light = dr.select(self.active, dr.mean(dr.abs(self.observer.selected.β * self.f)) / self.p, 0)
         a, b, c = probe_positions(self.length)
         survey = Survey.of([self.probe(t, self.active) for t in (a, b, c)], self.active)

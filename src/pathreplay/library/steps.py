@@ -36,7 +36,7 @@ class _Task:
         self.optimiser: adaptive.Optimiser | None = None
 
     def of(self, problem: Problem, name: str = "step") -> tuple[inner.Problem, Executor]:
-        """Return a problem with the settings of this task, and its executor. ``name`` starts error messages."""
+        """Return ``problem`` with the changed settings, and its executor. Error messages begin with ``name``."""
         if problem not in self._known:
             built = problem.configured(self._changes, name)
             config = built.config

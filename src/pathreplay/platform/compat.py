@@ -135,7 +135,7 @@ def mesh_arrays(params: Mapping[str, object]) -> MeshArrays | None:
     at = _index(params, "position_index", len(positions))
     normals, texcoords = _rows(params, NORMALS, 3), _rows(params, TEXCOORDS, 2)
     if len(normals):
-        # If the map of normals is empty, and there are as many normals as positions, the map of positions applies.
+        # With an empty `normal_index` and as many normals as positions, normals are indexed by `position_index`.
         with_positions = len(normals) == len(positions)
         normals = normals[_index(params, "normal_index", len(normals), at if with_positions else None)]
     return MeshArrays(np.array(params[_FACES]).reshape(-1, 3), positions[at], normals, texcoords)

@@ -1,6 +1,6 @@
-"""The objective of a check, F(t): a weighted mean of the image, as a function of one parameter along a curve.
+"""The objective of a check: a weighted mean F of the image, as a function of one scalar parameter π.
 
-Let π be the parameter, I_k the n values of the image, and w_k their weights. The objective F(π) = Σ_k w_k I_k(π) / n is
+Let I_k be the n values of the image, and w_k their weights. The objective F(π) = Σ_k w_k I_k(π) / n is
 linear in the image. The gradient of one noisy image is therefore an unbiased sample of the gradient of F, and the
 difference of two noisy images is an unbiased sample of a difference of F.
 """

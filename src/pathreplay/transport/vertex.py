@@ -284,7 +284,7 @@ class SampledStep(Step):
 
     @property
     def seen(self) -> mi.Bool:
-        """Mitsuba's alpha: whether the ray was scattered or absorbed, at a surface or at a collision."""
+        """Mitsuba's alpha: whether the ray met a surface or a real collision; it is then scattered or absorbed."""
         return self.signature.met & ~self.null
 
 

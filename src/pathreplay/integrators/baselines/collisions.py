@@ -39,7 +39,7 @@ def differentiate_flight(at: Arrival, flight: Flight, past: Sampler, active: mi.
 def differentiate_shadow(
     trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, past: Sampler, active: mi.Bool, weight: mi.Spectrum
 ) -> None:
-    """Differentiate the tentative collisions of an unoccluded shadow ray. Homogeneous media have no collisions."""
+    """Differentiate the tentative collisions of an unoccluded shadow ray. In homogeneous media, it has none."""
     stretch = Stretch.begin(ray, medium, active)
     while dr.hint(stretch.active, exclude=[trace], label="pathreplay: listing, shadow"):
         hit, a, b, inside = stretch.part(trace)

@@ -100,7 +100,7 @@ class Lens:
         return sampled * mask, mask
 
     def sampled(self, image: Image, x: np.ndarray, y: np.ndarray, extent: tuple[float, float]) -> tuple[Image, Image]:
-        """Interpolate a distorted image where a pinhole camera sees the directions (x, y, 1).
+        """Interpolate a distorted image at the pixels in which the lens shows the directions (x, y, 1).
 
         Args:
             image: the distorted image, shape (height, width, channels).

@@ -114,7 +114,7 @@ class Total:
         self._count += 1
 
     def _room(self, key: str) -> Array | None:
-        """Return the array with the sum of the gradients of a variable, to which the next sum may be written.
+        """Return the array that contains the sum of the gradients of a variable, if the next sum may overwrite it.
 
         Returns None if the array must not be overwritten, for example read-only memory from another process.
         """

@@ -68,8 +68,8 @@ class Speed:
 def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: int, name: str) -> Plan:
     """Choose the stages that fit into a time limit.
 
-    While the last stage has less than `LEAST` iterations, it is left out, and the other stages share its time. The
-    first stage is never left out.
+    If the last stage would have less than `LEAST` iterations, it is left out, and the other stages share its time. This
+    is repeated until the last stage has enough iterations or only the first stage is left.
 
     Args:
         speed: speed of the machine.
