@@ -24,6 +24,7 @@ from pathreplay.library.optimizers import Stepper, adapted, options_of
 from pathreplay.library.problem import Problem, run_settings
 from pathreplay.platform import memory
 from pathreplay.platform.interrupts import Stop, stopping
+from pathreplay.platform.threads import one_thread
 from pathreplay.report.live_pictures import LivePictures
 from pathreplay.report.notebook import NotebookPanel, progress_of
 from pathreplay.report.progress import Progress
@@ -159,9 +160,12 @@ def _minimized(
             raise PathreplayError("resume = True needs a folder; give 'output'")
         stack.enter_context(stopping(bar.say, "aborted" if kept is None else kept.remedy, stop))
         observers = [bar.observe, *_observers(bar, built, run, stop, kept)]
-        for about in stack.enter_context(closing(iterations(built, run, stop, observers, kept))):
-            if any([callback(about) is True for callback in callbacks]):
-                stop.by = stop.by or "a callback"
+        # Changing the thread pool once is safer than once per step, see `jobs.optimize`. Callbacks, however, may read
+        # files, for which Mitsuba needs two threads.
+        with one_thread(built.config.deterministic and not callbacks):
+            for about in stack.enter_context(closing(iterations(built, run, stop, observers, kept))):
+                if any([callback(about) is True for callback in callbacks]):
+                    stop.by = stop.by or "a callback"
         if kept is not None:
             bar.say("writing")
             found = kept.finish().parameters
