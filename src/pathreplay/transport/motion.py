@@ -83,8 +83,8 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        # `edges_move` ignores smooth lobes that are sampled attached. With boundary terms (which need attach = 'delta'),
-        # smooth lobes are sampled attached only in scenes without silhouettes.
+        # `edges_move` ignores smooth lobes that are sampled attached. Boundary terms need attach = 'delta', and
+        # smooth lobes are then sampled attached only in scenes without silhouettes.
         for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
             moving.append(sample.wo)
