@@ -76,14 +76,14 @@ def wall_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return take_photos(scene, [looking(np.array(back)) for back in backs], tmp_path_factory.mktemp("wall"))
 
 
-def take_photos(described: dict[str, Any], placed: list[np.ndarray], folder: Path) -> Path:
+def take_photos(described: dict[str, Any], placed: list[np.ndarray], folder: Path, depth: int = 1) -> Path:
     scene = mi.load_dict(described)
     frames = []
     for k, matrix in enumerate(placed):
         film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
         place = mi.ScalarTransform4f((matrix @ np.diag([-1.0, 1, -1, 1])).tolist())
         camera = mi.load_dict({"type": "perspective", "fov": math.degrees(FOV), "to_world": place, "film": film})
-        integrator = mi.load_dict({"type": "path", "max_depth": 1})
+        integrator = mi.load_dict({"type": "path", "max_depth": depth})
         image = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=64, seed=k))
         (folder / f"{k}.png").write_bytes(png_bytes(image))
         frames.append({"file_path": f"{k}.png", "transform_matrix": matrix.tolist()})
@@ -124,7 +124,7 @@ def test_frames_without_an_image_are_left_out(capture: Path, tmp_path: Path) -> 
     assert len(found.photos) == VIEWS
     assert "lost.png" in found.notes()[0]
     write(tmp_path, [{**frames[0], "file_path": "lost.png"}, *frames[:2]])
-    with pytest.raises(PathreplayError, match="2 of 3 images exist; add the image files"):
+    with pytest.raises(PathreplayError, match=r"2 of 3 images exist in .*; add the image files"):
         find_photos(tmp_path)
 
 
@@ -211,3 +211,31 @@ def test_from_photos_to_a_mesh(wall_capture: Path, tmp_path: Path) -> None:
     target = np.array(mi.Bitmap(str(result.folder / "images" / "target-view_1.exr")))
     spread = np.abs(target - target.mean((0, 1))).mean()
     assert np.abs(np.array(mi.render(scene, sensor=1, spp=16)) - target).mean() < 0.8 * spread
+
+
+@pytest.mark.slow
+def test_a_given_mesh_gets_its_texture_back(tmp_path: Path) -> None:
+    """The geometry is given; its texture and the sky are recovered, up to a common factor per colour."""
+    (tmp_path / "photos").mkdir()
+    mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().translate([1, 0, 0])}).write_ply(
+        str(tmp_path / "cube.ply")
+    )
+    rng = np.random.default_rng(3)
+    texels = mi.TensorXf(rng.uniform(0.1, 0.9, (4, 4, 3)).repeat(8, 0).repeat(8, 1).astype(np.float32))
+    paint = {"type": "diffuse", "reflectance": {"type": "bitmap", "data": texels, "raw": True}}
+    sky = np.linspace(1.0, 0.2, 16, dtype=np.float32)[:, None, None] * np.ones((1, 32, 3), np.float32)
+    scene = {
+        "type": "scene",
+        "cube": {"type": "ply", "filename": str(tmp_path / "cube.ply"), "bsdf": {"type": "twosided", "bsdf": paint}},
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
+    }
+    photos = take_photos(scene, cameras(), tmp_path / "photos", 3)
+    written = pathreplay.from_photos(photos, tmp_path / "job", mesh=tmp_path / "cube.ply", minutes=2.0)
+    result = pathreplay.optimize(written.job, output=tmp_path / "run", progress=False)
+    rows = [row for row in json.loads((result.folder / "views.json").read_text()).values() if row["is_test"]]
+    print(result.describe())
+    assert all(row["result"]["psnr"] > row["start"]["psnr"] + 6 for row in rows)
+    found = np.array(result.parameters["mesh.bsdf.brdf_0.reflectance.data"]).reshape(32, 8, 32, 8, 3).mean((1, 3))
+    truth = np.array(texels)
+    correlations = [np.corrcoef(found[..., k].ravel(), truth[..., k].ravel())[0, 1] for k in range(3)]
+    assert min(correlations) > 0.95

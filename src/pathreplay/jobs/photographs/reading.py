@@ -52,11 +52,12 @@ def find_photos(folder: Path) -> Found:
     """
     missing: list[str] = []
     source = folder if folder.suffix == ".json" else folder / TRANSFORMS
+    images = source.parent
     if not file_problem(source):
         photos = photos_of_json(source, picture_size, missing)
     elif (model := _model(folder)) is not None:
-        source = model
-        photos = photos_of_colmap(model, _images(folder, model), None, picture_size, missing)
+        source, images = model, _images(folder, model)
+        photos = photos_of_colmap(model, images, None, picture_size, missing)
     elif folder.is_dir():
         raise PathreplayError(
             f"{folder} has neither {TRANSFORMS} nor a COLMAP model (cameras.bin in {', '.join(MODELS)}); recover the "
@@ -66,8 +67,8 @@ def find_photos(folder: Path) -> Found:
         raise PathreplayError(f"No folder {shown(str(folder))}; give the folder of a capture, with its {TRANSFORMS}")
     if len(photos) < FEWEST:
         raise PathreplayError(
-            f"{source}: {len(photos)} of {len(photos) + len(missing)} images exist; add the image files, at least "
-            f"{FEWEST}"
+            f"{source}: {len(photos)} of {len(photos) + len(missing)} images exist in {images}; add the image files, "
+            f"at least {FEWEST}"
         )
     return Found(photos, source, missing)
 
