@@ -142,7 +142,7 @@ def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]
     """
 
     def run(
-        code: str, env: dict[str, str | None] | None = None, args: tuple[str, ...] = (), timeout: float = TIMEOUT_S
+        code: str, env: dict[str, str | None] | None = None, args: tuple[str, ...] = ()
     ) -> subprocess.CompletedProcess[str]:
         environment = dict(os.environ)
         for name, value in {"DRJIT_LIBLLVM_PATH": None, "DRJIT_CACHE_DIR": str(tmp_path), **(env or {})}.items():
@@ -156,7 +156,7 @@ def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
-            timeout=timeout,
+            timeout=TIMEOUT_S,
             check=False,
         )
 

@@ -309,7 +309,7 @@ print(json.dumps({
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
 def test_other_variants_have_the_same_gradients(run_python: Callable[..., Any], variant: str) -> None:
     folders = [str(ROOT / "tests" / "particles"), str(SUPPORT), str(ROOT / "tests")]
-    done = run_python(VARIANTS, args=(variant, *folders), timeout=600)  # minutes beside other tests
+    done = run_python(VARIANTS, args=(variant, *folders))
     assert done.returncode == 0, done.stderr[-3000:]
     print(done.stdout)
     values = json.loads(done.stdout.splitlines()[-1])

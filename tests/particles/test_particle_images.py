@@ -189,7 +189,7 @@ def test_other_variants_give_the_image_of_path(run_python, variant: str) -> None
     from places import ROOT, SUPPORT
 
     folders = [str(ROOT / "tests" / "particles"), str(SUPPORT), str(ROOT / "tests")]
-    done = run_python(VARIANTS, args=(variant, *folders), timeout=600)  # minutes beside other tests
+    done = run_python(VARIANTS, args=(variant, *folders))
     assert done.returncode == 0, done.stderr[-3000:]
     print(done.stdout)
     z = json.loads(done.stdout.splitlines()[-1])
