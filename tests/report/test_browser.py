@@ -290,6 +290,7 @@ def test_a_run_is_followed_and_stopped(browser: Any, tmp_path: Path) -> None:
         for each in (process, watch):
             if each.poll() is None:
                 each.kill()
+        watch.communicate()
 
 
 def test_a_mesh_is_shown_and_turns(show: Any) -> None:
