@@ -30,6 +30,8 @@ from pathreplay.scenes.loading import load_scene
 JOB = "job.toml"
 OPTICAL_DEPTH = 1.5
 """Optical depth of the initial medium along the longest side of the region."""
+OPAQUE = 5.0
+"""Upper bound of the optical depth of a voxel of the finest grid. The cost of a path grows with the largest density."""
 COARSE = 32
 """Voxels along the longest side of the initial grids; stages resample them."""
 TIMED_SPP = 4
@@ -109,7 +111,8 @@ def from_photos(
         speed = measure(part / "scene.xml", frames, near)
         tell(f"this machine renders {speed.samples / 1e6:.2g} million samples per second")
         plan = plan_stages(speed, minutes, trained, *size, str(output / JOB))
-        choices = Choices(has_sky or proxy is not None, refine_poses, near, HEADROOM * prepared.peak)
+        densest = OPAQUE * plan.stages[-1].resolution / float(region.size.max())
+        choices = Choices(has_sky or proxy is not None, refine_poses, near, HEADROOM * prepared.peak, densest)
         key = None if proxy is None else proxy.key
         _write(part, {JOB: job_text(str(folder), plan, choices, test_every, key).encode()})
     corners = " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (region.low, region.high))

@@ -22,6 +22,8 @@ class Choices:
     near_clip: float
     brightest: float
     """Upper bound of the radiance."""
+    densest: float
+    """Upper bound of the density."""
 
 
 def field_scene(box: Box, has_sky: bool) -> str:
@@ -102,7 +104,7 @@ def _xyz(values: Iterable[float]) -> str:
 def job_text(source: str, plan: Plan, choices: Choices, test_every: int, mesh_key: str | None = None) -> str:
     """Return the text of a job. ``mesh_key`` is the key of a given mesh's reflectance, or None for a density grid."""
     tables = [_head(source, choices.near_clip, plan, test_every, mesh_key is None), _EXPOSURE]
-    tables += _field(plan, choices.brightest) if mesh_key is None else [_colour(mesh_key)]
+    tables += _field(plan, choices) if mesh_key is None else [_colour(mesh_key)]
     if choices.has_sky:
         tables.append(_SKY)
     tables.append(_commented(_RESPONSE))
@@ -153,13 +155,14 @@ learning_rate = 0.01
 """
 
 
-def _field(plan: Plan, brightest: float) -> list[str]:
+def _field(plan: Plan, choices: Choices) -> list[str]:
     sizes = ", ".join(str(stage.resolution) for stage in plan.stages)
     return [
         f"""\
 [[parameters]]
 key = "{DENSITY}"
 parameterization = "log"
+upper = {choices.densest:.3g}                         # opaque; denser voxels only cost time
 resolutions = [{sizes}]
 learning_rate = 0.1
 """,
@@ -168,7 +171,7 @@ learning_rate = 0.1
 key = "{RADIANCE}"
 parameterization = "logit"           # between the bounds, so that no voxel becomes a light
 lower = 0.0
-upper = {brightest:.3g}
+upper = {choices.brightest:.3g}
 resolutions = [{sizes}]
 learning_rate = 0.1
 total_variation = 0.01               # smoother surfaces
