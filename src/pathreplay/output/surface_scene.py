@@ -63,22 +63,20 @@ def export_surface(run: Path, output: Path | None = None) -> str:
     low, size = _placed(job)
     cameras = _cameras(job)
     views = _compared(run, cameras)
-    best: tuple[float, mi.Mesh] | None = None
+    tried = THICKNESSES if views else THICKNESSES[:1]
+    meshes = (emitting_mesh(density[..., 0], radiance, low, size, thickness) for thickness in tried)
     with whole_folder(folder, "-o") as part:
         if SKY in values:
             (part / "sky.exr").write_bytes(exr_bytes(values[SKY]))
-        for thickness in THICKNESSES if views else THICKNESSES[:1]:
-            mesh = emitting_mesh(density[..., 0], radiance, low, size, thickness)
-            if not mesh.face_count():
-                continue
+        (part / "scene.xml").write_text(surface_xml([camera for camera, _ in views], SKY in values))
+
+        def error(mesh: mi.Mesh) -> float:
             mesh.write_ply(str(part / "surface.ply"))
-            (part / "scene.xml").write_text(surface_xml([camera for camera, _ in views], SKY in values))
-            error = _error(part / "scene.xml", [target for _, target in views])
-            if best is None or error < best[0]:
-                best = error, mesh
-        if best is None:
+            return _error(part / "scene.xml", [target for _, target in views])
+
+        mesh = min((mesh for mesh in meshes if mesh.face_count()), key=error, default=None)
+        if mesh is None:
             raise PathreplayError(f"The density grid of run {run} is empty; run more iterations")
-        mesh = best[1]
         mesh.write_ply(str(part / "surface.ply"))
         (part / "scene.xml").write_text(surface_xml(cameras, SKY in values))
     scene = folder / "scene.xml"
@@ -111,7 +109,10 @@ def _compared(run: Path, cameras: list[SceneDict]) -> list[tuple[SceneDict, np.n
 
 
 def _error(scene: Path, targets: list[np.ndarray]) -> float:
-    """Return the L1 error, as a display shows it, of images whose mean colours are adjusted to those of the targets."""
+    """Return the L1 error of the images of a scene, summed over its sensors, in sRGB-encoded values.
+
+    Each image is first multiplied by one factor per colour, so that its mean colour is that of its target.
+    """
     loaded, error = mi.load_file(str(scene)), 0.0
     for k, target in enumerate(targets):
         image = np.array(mi.render(loaded, sensor=k, spp=SPP))

@@ -27,7 +27,7 @@ VALUES = 4
 A_VALUE, A_VALUE_OF_VIEW = 40e-9, 6e-9
 """Seconds per number of the grids and iteration, and in addition per view."""
 TRACED = 4.0
-"""Kernels of an iteration, relative to those of an image. Each view is traced twice per stage."""
+"""Time to trace and compile an iteration, relative to an image. In each stage, each view is traced twice."""
 USED = 0.75
 """Fraction of the time limit that the plan uses, without rendering of test views and writing."""
 
