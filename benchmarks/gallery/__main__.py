@@ -30,6 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--reuse", action="store_true", help="run nothing; use the last finished runs")
     parser.add_argument("--page", action="store_true", help="run and draw nothing; write the page from the record")
     parser.add_argument("--runs", type=Path, default=RUNS, metavar="FOLDER", help="folder of the runs")
+    for repository in ("openexr-images", "pyrender"):
+        text = f"checkout of the repository {repository}, for the examples that need it"
+        parser.add_argument(f"--{repository}", type=Path, metavar="FOLDER", help=text)
     given = parser.parse_args(arguments)
     runs = given.runs.absolute()
     for name in given.names:
@@ -37,14 +40,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise PathreplayError(f"there is no entry {name!r}; use {', '.join(known)}")
     for name in () if given.page else given.names or known:
         entry = known[name]
+        checkouts = {key: getattr(given, key.lower()) for key in entry.checkouts}
         if given.reuse:
             found = reused(entry, runs)
+        elif None in checkouts.values():
+            options = " ".join(f"--{key.lower().replace('_', '-')} FOLDER" for key in checkouts)
+            print(f"{name} is skipped, because its data is in other repositories; add {options}")
+            continue
         else:
             if not given.busy:
                 require_idle(name)
             print(f"{name}: {' && '.join(entry.commands)}", flush=True)
             shutil.rmtree(runs / name, ignore_errors=True)
-            found = run(entry, runs)
+            found = run(entry, runs, [folder.absolute() for folder in checkouts.values()])
         IMAGES.mkdir(parents=True, exist_ok=True)
         (IMAGES / f"{name}.png").write_bytes(image_of(entry, runs / name))
         write_record(read_record() | {name: found})

@@ -18,11 +18,13 @@ class Entry:
     """Name of the view to show; the first one if empty."""
     prepare: str = ""
     """Path of the script in examples/ that writes the files of the job."""
+    checkouts: tuple[str, ...] = ()
+    """Arguments of the script: folders of other repositories, by name. An option of the gallery gives each path."""
 
     @property
     def commands(self) -> tuple[str, ...]:
         """Return the commands for a reader."""
-        prepare = (f"python examples/{self.prepare}",) if self.prepare else ()
+        prepare = (" ".join((f"python examples/{self.prepare}", *self.checkouts)),) if self.prepare else ()
         return (*prepare, f"pathreplay optimize examples/{self.config}")
 
 
@@ -47,6 +49,15 @@ ENTRIES = (
         "The texture and roughness of a ball and the sky around it, from twenty images and their cameras.",
         "capture/config.toml",
         prepare="capture/make_capture.py",
+    ),
+    Entry(
+        "real-sky",
+        "A bottle under a real sky",
+        "The texture of a scanned bottle and the photographed sky around it, from eight images.",
+        "real-sky/config.toml",
+        view="test",
+        prepare="real-sky/make_assets.py",
+        checkouts=("OPENEXR_IMAGES", "PYRENDER"),
     ),
     Entry(
         "glass-ball",

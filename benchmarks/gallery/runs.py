@@ -95,11 +95,14 @@ def require_idle(name: str) -> None:
         )
 
 
-def run(entry: Entry, runs: Path) -> Run:
-    """Run the commands of an entry; the run folder is runs/NAME, which must not exist."""
+def run(entry: Entry, runs: Path, checkouts: Sequence[Path] = ()) -> Run:
+    """Run the commands of an entry; the run folder is runs/NAME, which must not exist.
+
+    ``checkouts`` are the arguments of the script that writes the files of the job.
+    """
     folder = runs / entry.name
     if entry.prepare:
-        _call([sys.executable, f"examples/{entry.prepare}"])
+        _call([sys.executable, f"examples/{entry.prepare}", *map(str, checkouts)])
     listener = Listener()
     job = [sys.executable, "-m", "pathreplay.cli", "optimize", f"examples/{entry.config}"]
     _call([*job, "--output", str(folder)])

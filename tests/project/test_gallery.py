@@ -40,8 +40,8 @@ def finished(folder: Path, entry: Entry, size: int = 32, noise: bool = False) ->
     return images.parent
 
 
-def test_there_are_twelve_jobs_and_each_is_valid() -> None:
-    assert len(ENTRIES) == len({entry.name for entry in ENTRIES}) == 12
+def test_there_are_thirteen_jobs_and_each_is_valid() -> None:
+    assert len(ENTRIES) == len({entry.name for entry in ENTRIES}) == 13
     for entry in ENTRIES:
         load_config(ROOT / "examples" / entry.config)
         assert not entry.prepare or (ROOT / "examples" / entry.prepare).is_file()
@@ -101,21 +101,49 @@ def test_processor_time_of_the_machine_and_of_ours_increase_together() -> None:
     assert runs.busy_seconds() - listener.busy > 0.2
 
 
-def test_runs_are_reused_and_the_page_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder where the record, the page and the images of the command are, in place of those of the checkout."""
     for name, place in (("RECORD", "gallery.json"), ("PAGE", "gallery.md"), ("IMAGES", "images")):
         monkeypatch.setattr(page, name, tmp_path / place)
         if hasattr(command, name):
             monkeypatch.setattr(command, name, tmp_path / place)
-    arguments = ["glass-ball", "--reuse", "--runs", str(tmp_path / "runs")]
+    return tmp_path
+
+
+def test_an_example_with_data_of_other_repositories_is_skipped_without_them(
+    written: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With them, the script gets their absolute paths; here it is the only command that runs."""
+    called: list[list[str]] = []
+
+    def call(arguments: list[str]) -> None:
+        called.append(arguments)
+        raise PathreplayError("enough")
+
+    monkeypatch.setattr(runs, "_call", call)
+    arguments = ["real-sky", "--busy", "--runs", str(written / "runs"), "--pyrender", "elsewhere"]
+    command.main(arguments)
+    skipped, _ = capsys.readouterr().out.splitlines()
+    assert skipped.startswith("real-sky is skipped") and "--openexr-images FOLDER --pyrender FOLDER" in skipped
+    assert not called and page.read_record() == {}
+    with pytest.raises(PathreplayError, match="enough"):
+        command.main([*arguments, "--openexr-images", str(written)])
+    script = [sys.executable, "examples/real-sky/make_assets.py"]
+    assert called == [[*script, str(written), str(Path("elsewhere").absolute())]]
+
+
+def test_runs_are_reused_and_the_page_is_written(written: Path) -> None:
+    arguments = ["glass-ball", "--reuse", "--runs", str(written / "runs")]
     with pytest.raises(PathreplayError, match=r"history\.jsonl"):
         command.main(arguments)
-    folder = finished(tmp_path / "runs", next(entry for entry in ENTRIES if entry.name == "glass-ball"))
+    folder = finished(written / "runs", next(entry for entry in ENTRIES if entry.name == "glass-ball"))
     with pytest.raises(PathreplayError, match="not the record of a run"):
         command.main(arguments)
     (folder / "gallery.json").write_bytes(runs._RUN.dump_json(RUN))
     command.main(arguments)
     assert page.read_record() == {"glass-ball": RUN}
-    assert (tmp_path / "gallery.md").read_text().count("Not run yet") == 11
-    assert (tmp_path / "images/glass-ball.png").is_file()
+    assert (written / "gallery.md").read_text().count("Not run yet") == 12
+    assert (written / "images/glass-ball.png").is_file()
     with pytest.raises(PathreplayError, match="there is no entry 'moon'"):
         command.main(["moon"])
