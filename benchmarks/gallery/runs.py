@@ -9,6 +9,7 @@ import resource
 import shlex
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -98,6 +99,7 @@ def require_idle(name: str) -> None:
 def run(entry: Entry, runs: Path, checkouts: Sequence[Path] = ()) -> Run:
     """Run the commands of an entry; the run folder is runs/NAME, which must not exist.
 
+    The kernel cache is empty, so that the times are those of a first run.
     ``checkouts`` are the arguments of the script that writes the files of the job.
     """
     folder = runs / entry.name
@@ -105,7 +107,8 @@ def run(entry: Entry, runs: Path, checkouts: Sequence[Path] = ()) -> Run:
         _call([sys.executable, f"examples/{entry.prepare}", *map(str, checkouts)])
     listener = Listener()
     job = [sys.executable, "-m", "pathreplay.cli", "optimize", f"examples/{entry.config}"]
-    _call([*job, "--output", str(folder)])
+    with tempfile.TemporaryDirectory() as cache:
+        _call([*job, "--output", str(folder)], DRJIT_CACHE_DIR=cache)
     seconds, others = time.perf_counter() - listener.begin, listener.others()
     history = history_of(folder)
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -125,8 +128,8 @@ def run(entry: Entry, runs: Path, checkouts: Sequence[Path] = ()) -> Run:
     return found
 
 
-def _call(command: Sequence[str]) -> None:
-    done = subprocess.run(command, cwd=ROOT)
+def _call(command: Sequence[str], **environment: str) -> None:
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | environment)
     if done.returncode != 0:
         raise PathreplayError(f"{shlex.join(command)} ended with status {done.returncode}; its message is above")
 
