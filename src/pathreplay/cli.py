@@ -178,7 +178,8 @@ def optimize(
     config: Annotated[Path | None, typer.Argument(help="Job in TOML or YAML; see docs/optimize.md.")] = None,
     resume: Annotated[Path | None, typer.Option(metavar="RUN_FOLDER", help="Resume an unfinished run instead.")] = None,
     output: Annotated[
-        Path | None, typer.Option(help="Run folder to create (default: runs/<name of the config>).")
+        Path | None,
+        typer.Option("--output", "-o", metavar="FOLDER", help="Run folder to create (default: runs/<config>)."),
     ] = None,
     changes: Annotated[
         list[str] | None,
