@@ -93,7 +93,7 @@ def page(record: dict[str, Run]) -> str:
         "# Gallery",
         "What the jobs in `examples/` recover. Each row shows the image at the start, the image of the result, and the "
         "target. `python -m benchmarks.gallery` makes the runs, the images and this page; times are those of all "
-        "iterations of a first run, without cached kernels, on an otherwise idle machine.",
+        "iterations on an otherwise idle machine.",
         *(section(entry, record.get(entry.name)) for entry in ENTRIES),
     ]
     return "\n\n".join(parts) + "\n"
