@@ -19,6 +19,11 @@ from .runs import require_idle, reused, run
 RUNS = ROOT / "runs" / "gallery"
 
 
+def option(key: str) -> str:
+    """Return the option that gives a checkout of an entry: its name in the entry is that of the repository."""
+    return f"--{key.lower().replace('_', '-')}"
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(
@@ -30,9 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--reuse", action="store_true", help="run nothing; use the last finished runs")
     parser.add_argument("--page", action="store_true", help="run and draw nothing; write the page from the record")
     parser.add_argument("--runs", type=Path, default=RUNS, metavar="FOLDER", help="folder of the runs")
-    for repository in ("openexr-images", "pyrender"):
-        text = f"checkout of the repository {repository}, for the examples that need it"
-        parser.add_argument(f"--{repository}", type=Path, metavar="FOLDER", help=text)
+    for key in dict.fromkeys(key for entry in ENTRIES for key in entry.checkouts):
+        text = "checkout of this repository, for the examples that need it"
+        parser.add_argument(option(key), dest=key, type=Path, metavar="FOLDER", help=text)
     given = parser.parse_args(arguments)
     runs = given.runs.absolute()
     for name in given.names:
@@ -40,11 +45,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise PathreplayError(f"there is no entry {name!r}; use {', '.join(known)}")
     for name in () if given.page else given.names or known:
         entry = known[name]
-        checkouts = {key: getattr(given, key.lower()) for key in entry.checkouts}
+        checkouts = {key: getattr(given, key) for key in entry.checkouts}
         if given.reuse:
             found = reused(entry, runs)
         elif None in checkouts.values():
-            options = " ".join(f"--{key.lower().replace('_', '-')} FOLDER" for key in checkouts)
+            options = " ".join(f"{option(key)} FOLDER" for key in checkouts)
             print(f"{name} is skipped, because its data is in other repositories; add {options}")
             continue
         else:

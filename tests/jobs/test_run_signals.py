@@ -43,8 +43,8 @@ def test_signals_that_wait_come_after_an_error_too() -> None:
 
 
 def test_two_ctrl_c_at_once_abort_in_one_line(tmp_path: Path) -> None:
-    # So many samples of the last images that the second signal arrives before they are rendered.
-    process = start(tmp_path, str(write_job(tmp_path, **{**ENDLESS, "eval_spp": 20_000})), "--quiet")
+    # Rendering the last images takes so long that the second signal arrives before the run has ended.
+    process = start(tmp_path, str(write_job(tmp_path, **ENDLESS, eval_spp=20_000)), "--quiet")
     kill_at_checkpoint(tmp_path, process, 2, signal.SIGINT)
     for _ in range(2):
         time.sleep(0.02)

@@ -103,7 +103,7 @@ def test_processor_time_of_the_machine_and_of_ours_increase_together() -> None:
 
 @pytest.fixture
 def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder where the record, the page and the images of the command are, in place of those of the checkout."""
+    """A folder to which the command writes the record, the page and the images, in place of the checkout."""
     for name, place in (("RECORD", "gallery.json"), ("PAGE", "gallery.md"), ("IMAGES", "images")):
         monkeypatch.setattr(page, name, tmp_path / place)
         if hasattr(command, name):
