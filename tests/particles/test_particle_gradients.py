@@ -26,6 +26,7 @@ from pathreplay.testing.stencil import CENTRAL
 from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from places import ROOT, SUPPORT
 from truth import TRANSPOSE_MAX, add, random, rotate, translate
+from variant import MONO, SPECTRAL
 
 PLUGIN = "pathreplay_particles"
 SAME_SEED_MAX = 1e-3
@@ -306,7 +307,7 @@ print(json.dumps({
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+@pytest.mark.parametrize("variant", [MONO, SPECTRAL])
 def test_other_variants_have_the_same_gradients(run_python: Callable[..., Any], variant: str) -> None:
     folders = [str(ROOT / "tests" / "particles"), str(SUPPORT), str(ROOT / "tests")]
     done = run_python(VARIANTS, args=(variant, *folders))

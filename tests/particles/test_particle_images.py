@@ -20,6 +20,7 @@ from particle_scenes import balls, blocks, emitters, images, meter, perturbed, r
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
 from truth import rgb
+from variant import MONO, SPECTRAL
 
 DEPTH = 5
 PIXELS = particle_scenes.WIDTH * particle_scenes.HEIGHT
@@ -184,7 +185,7 @@ print(json.dumps({
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+@pytest.mark.parametrize("variant", [MONO, SPECTRAL])
 def test_other_variants_give_the_image_of_path(run_python, variant: str) -> None:
     from places import ROOT, SUPPORT
 

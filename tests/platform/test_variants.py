@@ -6,6 +6,8 @@ import json
 
 import pytest
 
+from variant import BACKEND, MONO, SPECTRAL
+
 # Renders with each of our plugins and differentiates, in each variant named on the command line; what a variant gives
 # the second time has to be what it gave the first time. Earlier scenes stay alive on purpose.
 SEQUENCE = """
@@ -15,7 +17,8 @@ import pathreplay
 from pathreplay.platform.backend import ensure_llvm
 import drjit as dr, mitsuba as mi
 
-ensure_llvm()
+if any(name.startswith("llvm") for name in sys.argv[1:]):
+    ensure_llvm()
 glass = {"type": "dielectric_ad", "int_ior": 1.2}
 
 def scene(extra):
@@ -70,12 +73,13 @@ for variant in sys.argv[1:]:
         print(json.dumps([variant, plugin, key, *derivative(made, integrator, key)]))
 """
 
+RGB = f"{BACKEND}_ad_rgb"
 SEQUENCES = {
-    "over scalar": ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_rgb"),
-    "there and back": ("llvm_ad_rgb", "llvm_ad_mono", "scalar_rgb", "llvm_ad_rgb"),
-    "scalar first": ("scalar_rgb", "llvm_ad_mono", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_mono"),
-    "spectral first": ("llvm_ad_spectral", "llvm_ad_rgb", "llvm_ad_spectral"),
-    "all": ("llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral"),
+    "over scalar": (RGB, "scalar_rgb", RGB),
+    "there and back": (RGB, MONO, "scalar_rgb", RGB),
+    "scalar first": ("scalar_rgb", MONO, "scalar_spectral", RGB, MONO),
+    "spectral first": (SPECTRAL, RGB, SPECTRAL),
+    "all": (MONO, SPECTRAL, MONO, RGB, SPECTRAL),
 }
 QUICK = "over scalar"
 
@@ -170,9 +174,9 @@ for variant in variants:
 """
 
 JOBS = {
-    "mono": ("llvm_ad_mono",),
-    "spectral": ("llvm_ad_spectral",),
-    "in turn": ("llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono", "llvm_ad_rgb"),
+    "mono": (MONO,),
+    "spectral": (SPECTRAL,),
+    "in turn": (RGB, SPECTRAL, MONO, RGB),
 }
 
 
@@ -226,7 +230,7 @@ for edges in ("all", "none"):
 
 
 @pytest.mark.slow  # the quick tests hold edges to finite differences in one variant
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+@pytest.mark.parametrize("variant", [MONO, SPECTRAL])
 def test_edges_are_right_in_every_variant(run_python, variant: str) -> None:
     done = run_python(EDGES_JOB, args=(variant,))
     assert done.returncode == 0, done.stderr[-3000:]
@@ -239,7 +243,7 @@ def test_the_variants_here_are_all_that_there_are() -> None:
 
     from pathreplay.platform.backend import is_usable_variant
 
-    usable = {name for name in mi.variants() if is_usable_variant(name) and name.startswith("llvm")}
+    usable = {name for name in mi.variants() if is_usable_variant(name) and name.startswith(BACKEND)}
     assert usable == {variant for sequence in JOBS.values() for variant in sequence}
 
 

@@ -16,6 +16,7 @@ import pytest
 from pathreplay.plugins import grid_traversal
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
+from variant import MONO, SPECTRAL
 
 RAYS = 1 << 12
 T = mi.ScalarTransform4f
@@ -561,7 +562,7 @@ print("fine")
 """
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
+@pytest.mark.parametrize("variant", [SPECTRAL, MONO])
 def test_other_variants(run_python: Any, variant: str) -> None:
     done = run_python(OTHER_VARIANT, args=(variant,))
     assert "fine" in done.stdout, done.stderr  # Mitsuba colours its log, at either end

@@ -3,3 +3,6 @@
 import os
 
 VARIANT = os.environ.get("PATHREPLAY_TEST_VARIANT", "llvm_ad_rgb")
+BACKEND = VARIANT.partition("_")[0]
+#: Variants with other colours on the same back end, for tests that start a process in them.
+MONO, SPECTRAL = f"{BACKEND}_ad_mono", f"{BACKEND}_ad_spectral"
