@@ -27,11 +27,6 @@ CONTEXTS = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def context(mode: str = RADIANCE, component: int | None = None, type_mask: str | None = None):
     ctx = mi.BSDFContext(getattr(mi.TransportMode, mode))
     if component is not None:

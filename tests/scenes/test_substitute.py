@@ -38,11 +38,6 @@ MATERIALS = """<scene version="3.0.0">
 </scene>"""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture
 def scene_file(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)

@@ -24,6 +24,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.device import device_of
 from pathreplay.platform.properties import Property
 from pathreplay.plugins import grid_traversal
 from pathreplay.plugins.supergrid import (
@@ -223,7 +224,16 @@ class GridMedium:
 
         If ``emission_per_extinction``, the result is the radiance emitted per unit of optical depth.
         """
-        return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
+        return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, _recordable(active))
+
+
+def _recordable(active: mi.Bool | bool) -> mi.Bool | bool:
+    """Return the mask for a lookup outside of a virtual call, which a frozen function may record.
+
+    On a GPU all lanes look up the volume. Dr.Jit 1.5 replaces the texture of masked lanes by a null pointer, and aborts
+    the process when it records a kernel with this pointer.
+    """
+    return True if device_of(mi.variant()).is_gpu else active
 
 
 # ---------------------------------------------- reading the properties ----------------------------------------------

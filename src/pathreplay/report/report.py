@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import PIL.Image
 
+from pathreplay import __version__
 from pathreplay.inverse.images.io import Image, displayed, png_bytes, resized
 from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.inverse.parameters.grids import shown
@@ -335,7 +336,7 @@ def summary(outcome: Outcome) -> bytes:
 def versions() -> dict[str, str]:
     """Return the versions and system properties that affect a run in addition to its config, by name."""
     return {
-        "pathreplay": version("pathreplay"),
+        "pathreplay": __version__,
         "Mitsuba": version("mitsuba"),
         "Dr.Jit": version("drjit"),
         "variant": mi.variant(),
