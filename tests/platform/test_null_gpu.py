@@ -8,7 +8,6 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -54,7 +53,8 @@ for name in sys.argv[2:]:
             for seed in range(3):
                 request = RenderRequest(0, mi.UInt32(seed), 4)
                 try:
-                    result = recordings.differentiate(params, scene, integrator, request, target, ViewLoss(l2, 1.0, swept))
+                    of_view = ViewLoss(l2, 1.0, swept)
+                    result = recordings.differentiate(params, scene, integrator, request, target, of_view)
                 except NotRecordable:
                     recorded = False
                     break
