@@ -39,7 +39,7 @@ __all__ = [
     "value_and_grad",
 ]
 
-#: Package of each public name that is imported on first access, because its package takes long to import.
+#: Public names that are imported on first access, with the package of each name. These packages take long to import.
 _LAZY = {
     "Derived": "pathreplay.library",
     "Iteration": "pathreplay.library",
@@ -75,12 +75,12 @@ def _set_up() -> None:
     try:
         os.getcwd()
     except OSError:
-        return  # the current folder was removed: Mitsuba would crash Python at exit; `main` reports the error
+        return  # With a removed current folder, Mitsuba would crash Python at exit. `main` reports the error.
     from pathreplay.platform import address_space
 
     if address_space.is_too_small():
         return  # Mitsuba would hang while loading; `address_space.require` reports the error later
-    # Before the first import of mitsuba: Dr.Jit looks for libLLVM while it is imported.
+    # `point_drjit` must be called before mitsuba is first imported, because that import makes Dr.Jit look for libLLVM.
     from pathreplay.platform import backend, interrupts, registration
 
     backend.point_drjit()
@@ -88,7 +88,7 @@ def _set_up() -> None:
         with interrupts.undisturbed():  # Ctrl-C during this import would crash the process
             import mitsuba  # noqa: F401
     except Exception:
-        return  # Mitsuba is missing or broken: `set_variant` and the doctor report the remedy
+        return  # Mitsuba is missing or broken: `set_variant` and `pathreplay doctor` report the remedy
     registration.install()
 
 

@@ -1,8 +1,8 @@
 """Integrators to compare `pathreplay` with: `naive_ad`, `radiative_backprop` and `prb_volume_listing`.
 
-These three integrators use the same light-transport step as `pathreplay`. They show the memory, time and noise of other
-ways to differentiate a path tracer. `pathreplay` computes the same gradients at lower cost, or gradients that the three
-integrators miss.
+These three integrators use the same code as `pathreplay` for a step of a path. They show the memory, time and noise of
+other ways to differentiate a path tracer. Where they compute the same gradients as `pathreplay`, their cost is higher.
+They miss some gradients that `pathreplay` computes.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Exit status 0 means success, 1 a negative result (a gradient fails its check, or no variant runs on this machine), and 2
 an error that the user has to fix. If a signal ends the command, the status is 128 plus the signal number (130 for
-Ctrl-C). After a signal, `optimize` writes its results and exits with 0. Heavy modules are imported inside the commands,
-so that `pathreplay --help` responds immediately.
+Ctrl-C). `optimize` is an exception: after a signal, it writes its results and exits with 0. Heavy modules are imported
+inside the commands, so that `pathreplay --help` responds immediately.
 """
 
 from __future__ import annotations
@@ -378,7 +378,7 @@ def _require_text_and_folder(arguments: list[str]) -> None:
         raise PathreplayError(f"argument '{argument}' is not UTF-8; rename the file or folder") from None
     try:
         os.getcwd()
-    except OSError:  # Mitsuba would crash the process
+    except OSError:  # without a current folder, Mitsuba would crash the process at exit
         raise PathreplayError("the current folder was removed; change to another and start again") from None
 
 
@@ -402,8 +402,8 @@ def main() -> None:
 def _flush_streams() -> str:
     """Flush stdout and stderr, and discard output that cannot be written.
 
-    Returns why stdout could not be written, or "". Without this call, Python would flush at exit and report a failure
-    only by exit status 120.
+    Returns why stdout could not be written, or "". Without this call, Python would flush the streams at exit, and
+    would report a failure to write them only by exit status 120.
     """
     problem = ""
     for stream in filter(None, (sys.stdout, sys.stderr)):  # a stream that was closed at the start is None
@@ -419,7 +419,7 @@ def _flush_streams() -> str:
 def _run() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal that cannot print ± must not end a run
+            stream.reconfigure(errors="backslashreplace")  # a terminal may be unable to print ±
     try:
         with interrupts.raised():
             address_space.require()

@@ -36,8 +36,8 @@ class VariantVerdict:
 class DoctorReport:
     """Versions, test results, and remedies.
 
-    `mitsuba` and `drjit` are version numbers. If one of them cannot be imported, `mitsuba` is the reason and `drjit` is
-    "unknown". `remedies` has one line for each failure that the user can fix.
+    `mitsuba` and `drjit` are version numbers. If one of these packages cannot be imported, `mitsuba` contains the
+    reason, and `drjit` is "unknown". `remedies` has one line for each failure that the user can fix.
     """
 
     mitsuba: str
@@ -80,7 +80,8 @@ class DoctorReport:
         line(("Verdict", "bold"), f": pathreplay runs here ({usable})" if usable else ": pathreplay does not run here")
 
 
-#: Test program: a sphere under a constant emitter needs ray tracing and virtual calls, and its gradient is positive.
+#: The test program renders a sphere under a constant emitter, which needs ray tracing and virtual calls. Its gradient
+#: is positive.
 _PROBE = """
 import drjit as dr, mitsuba as mi
 mi.set_variant(task["variant"])
@@ -107,7 +108,10 @@ if not 0.0 < gradient < 100.0:
 
 
 def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[VariantVerdict]:
-    """Test the variants in order. If one fails, the later variants of its back end count as failed without a test."""
+    """Test the variants in order.
+
+    If a variant fails, later variants of the same back end are not tested and count as failed.
+    """
     environment = os.environ | ({ENVIRONMENT_VARIABLE: library.path} if library else {})
     preload = llvm.unlinked_siblings(library.path) if library else []
     verdicts = []

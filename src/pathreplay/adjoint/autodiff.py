@@ -1,4 +1,7 @@
-"""Reverse and forward differentiation of a single step: the only module that calls automatic differentiation."""
+"""Differentiates a single step of a path in reverse or forward mode.
+
+No other module calls automatic differentiation.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ class Unreached(PathreplayError):
 
 @dataclass
 class RayDerivative:
-    """The derivative of a ray and of its density: the adjoint q in reverse mode, the tangent in forward mode."""
+    """The adjoint q of a ray and of its density in reverse mode, or their tangent in forward mode."""
 
     o: mi.Point3f
     d: mi.Vector3f
@@ -28,8 +31,8 @@ class RayDerivative:
 
     @staticmethod
     def zero() -> RayDerivative:
-        # Not dr.zeros, which reads the field types of a class only once: it would use the types of the first variant in
-        # all later variants.
+        # dr.zeros reads the field types of a class only once. It would use the types of the first variant in all later
+        # variants, and is therefore not called here.
         return RayDerivative(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
 
     def finite_part(self) -> tuple[RayDerivative, mi.Bool]:
@@ -39,7 +42,10 @@ class RayDerivative:
 
 
 class NonFiniteCounter:
-    """Counts the paths whose gradient is incomplete, because a part was not finite or a record was full."""
+    """Counts the paths whose gradient is incomplete.
+
+    A gradient is incomplete if one of its terms was not finite, or if the record of the path was full.
+    """
 
     def __init__(self) -> None:
         self.count = dr.zeros(mi.UInt32, 1)
@@ -106,7 +112,7 @@ def backward_step(
 def forward_step(
     trace: TraceConfig, v: VertexRecord, attached: bool, tangent: RayDerivative, active: mi.Bool
 ) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative]:
-    """Evaluate step i again. Return the step, and the tangents of e_i, of w_i and of the next ray."""
+    """Evaluate the step at vertex i again; return it, and the tangents of e_i, w_i (see `Step`) and the next ray."""
     with dr.resume_grad():
         at = _with_tangent(v.at, tangent) if attached else v.at
         step = repeat_step(trace, replace(v, at=at), attached, active)
@@ -115,7 +121,7 @@ def forward_step(
 
 
 class Footprint(Protocol):
-    """Weights of the pixels around a film position, along both axes."""
+    """Weights with which the pixels around a film position receive a contribution, along both axes of the film."""
 
     x: list[mi.Float]
     y: list[mi.Float]
@@ -202,7 +208,10 @@ def _attached_ray(ray: mi.Ray3f) -> mi.Ray3f:
 
 
 def tangents(*values: Any) -> list[Any]:
-    """Forward-propagate from the parameters to all values in one traversal; values without gradients get zero."""
+    """Return the tangents of all values, propagated from the parameters in one traversal.
+
+    The tangent of a value without gradients is zero.
+    """
     attached = [value for value in values if dr.grad_enabled(value)]
     if not attached:
         return [dr.zeros(type(value)) for value in values]
@@ -219,6 +228,6 @@ def backward(target: mi.Float) -> None:
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):
-            return  # Dr.Jit runs each loop iteration separately, and a different iteration may have gradients.
+            return  # Dr.Jit runs loop iterations one by one; ``target`` may have gradients in another iteration.
         raise Unreached("no parameter with gradients reaches the light paths")
     dr.backward_from(target)

@@ -21,20 +21,21 @@ from pathreplay.errors import PathreplayError
 from pathreplay.transport.vertex import VertexRecord
 from pathreplay.transport.volume.media import interaction, majorant, span
 
-# Cells along each axis of space, and along each side of the octahedral map of directions. 8³ x 4² cells of two averages
-# with four values each take 256 KiB. Three such arrays exist: the averages, the sums from which they are computed, and
-# the sums of the current pass. With more cells, each cell has fewer samples and gradients are noisier: see the cloud of
+# CELLS is the number of cells along each axis of space. SIDES is the number of cells along each side of the octahedral
+# map of directions. Each of the 8³ x 4² cells has two averages, and each average has four values: 256 KiB in total.
+# Three arrays have this size: the averages, the sums from which the averages are computed, and the sums of the current
+# pass. If there were more cells, each cell would have fewer samples, and gradients would be noisier: see the cloud of
 # `pathreplay bench media`.
 CELLS, SIDES = 8, 4
 AVERAGES = 2 * CELLS**3 * SIDES**2  # the averages X and Y of each cell (see the module), side by side
 # Factor by which the previous sums are multiplied when a pass is added. About the last ten passes contribute.
 MEMORY = 0.9
-# Initial relative weight c of null collisions (see `branch_weight`). `BaselineState.after` computes about this weight
-# if a path has fifty null collisions on average.
+# Initial relative weight c of null collisions (see `branch_weight`). Later weights are computed by
+# `BaselineState.after`. They are about as large as this weight if a path has fifty null collisions on average.
 FIRST_BRANCHING = 0.02
 # Null collisions are counted in this many partial sums, so that no sum is too large for float32.
 SLOTS = 256
-# Weight of the mean over all cells in the average of one cell, in units of samples of this cell.
+# The average of a cell includes the mean over all cells, which counts as much as this many samples of the cell.
 PRIOR = 2.0
 
 
@@ -60,7 +61,7 @@ class BaselineCells:
         return BaselineCells(tuple(map(float, box.min)), tuple(scale))
 
     def index(self, p: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
-        """Return the index of the average X of a cell (see the module). The average Y of this cell is the next one."""
+        """Return the index of the average X of a cell (see the module). The cell's average Y has the next index."""
         at = mi.Vector3u(
             dr.clip(mi.Vector3f(p - mi.ScalarPoint3f(self.low)) * mi.ScalarVector3f(self.scale), 0, CELLS - 1)
         )
@@ -84,9 +85,9 @@ class BaselineStats:
 
     @staticmethod
     def none(cells: BaselineCells, *keys: Hashable) -> BaselineStats:
-        """Create empty statistics, to which passes with these ``keys`` will be added.
+        """Create empty statistics. The passes that will be added to them have the given ``keys``.
 
-        A pass recorded in a frozen function has no key.
+        A pass that is recorded in a frozen function has no key.
         """
         sums, nulls = dr.zeros(mi.Float, 4 * AVERAGES), dr.zeros(mi.Float, SLOTS)
         dr.make_opaque(sums, nulls)
@@ -118,7 +119,7 @@ class BaselineStats:
         dr.scatter_add(self.sums, mi.Vector4f(x, y, z, 1) * weight, cell, active)
 
     def tally(self, nulls: mi.Float) -> None:
-        """Add the number of null collisions of each path."""
+        """Add each path's number of null collisions to the statistics."""
         paths = dr.width(nulls)
         dr.scatter_add(self.nulls, nulls, dr.arange(mi.UInt32, paths) % SLOTS)
         self.paths += paths
@@ -126,7 +127,7 @@ class BaselineStats:
 
 @dataclass(frozen=True)
 class Baseline:
-    """The part of a baseline that a pass reads, suitable as an input of a frozen function.
+    """The part of a `BaselineState` that a pass reads. A frozen function accepts this class as an input.
 
     ``branching`` is the relative weight c of null collisions (see `branch_weight`).
     """
@@ -136,7 +137,7 @@ class Baseline:
     branching: mi.Float
 
     def lookup(self, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
-        """Look up the baseline at an interaction, for radiance from the direction -mei.wi; σ̄ is the majorant."""
+        """Estimate the radiance that arrives at an interaction from the direction -mei.wi. σ̄ is the majorant."""
         mei, σ_t = dr.detach(mei), dr.detach(σ_t)
         cell = self.cells.index(mei.p, -mei.wi)
         X, Y = dr.gather(mi.Vector4f, self.known, cell, active), dr.gather(mi.Vector4f, self.known, cell + 1, active)

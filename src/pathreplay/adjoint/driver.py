@@ -25,7 +25,8 @@ class Driver(Protocol):
 class ForwardDriver(Protocol):
     """Computes the tangent of the radiance from the tangents of the parameters.
 
-    Returns the tangent and Mitsuba's alpha per path, and whether paths move. ``lost`` is as in `Driver`.
+    Returns the tangent and Mitsuba's alpha of each path, and whether paths move (see `Driver`). ``lost`` counts the
+    paths whose tangent is incomplete.
     """
 
     def __call__(

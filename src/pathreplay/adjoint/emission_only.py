@@ -24,9 +24,9 @@ from pathreplay.transport.vertex import TraceConfig
 def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """Return whether only emitted radiance has gradients: no weight depends on a parameter, and nothing moves.
 
-    One step is traced symbolically, which includes the virtual functions of all objects. With media, the result is
-    False. If Dr.Jit evaluates virtual calls, the step includes only the objects at the first vertices. The result is
-    then also False.
+    The result is always False in scenes with media. It is also always False if symbolic calls are turned off in Dr.Jit.
+    With symbolic calls, one traced step covers the virtual functions of all objects of the scene. Without symbolic
+    calls, the step would cover only the objects at the first vertices.
     """
     if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False

@@ -18,9 +18,9 @@ def forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> t
     """Compute the tangent of the radiance along the rays of a ``start``.
 
     The parameters must have tangents before the call. Returns ``(δL, valid, moves)``: tangent and alpha per ray, and
-    whether paths move with the parameters. If they do, ``lost`` counts the paths whose tangent was not finite and was
-    set to zero. The recurrence δβ_{i+1} = δβ_i w_i + β_i δw_i contains no division, and is therefore correct where a
-    weight is exactly zero. Not differentiated: visibility and, with ``attach='none'``, all motion.
+    whether paths move with the parameters. If paths move, ``lost`` counts the paths whose tangent was not finite and
+    was set to zero. The recurrence δβ_{i+1} = δβ_i w_i + β_i δw_i contains no division, and is therefore correct where
+    a weight is exactly zero. Not differentiated: visibility and, with ``attach='none'``, all motion.
     """
     with dr.resume_grad():
         δo, δd = tangents(*start.repeat())

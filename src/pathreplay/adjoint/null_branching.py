@@ -42,7 +42,7 @@ class Branch:
         return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, mi.Float(0), mi.Float(0), mi.UInt32(0), mi.Float(1))
 
     def offer(self, path: PathState, step: SampledStep) -> Branch:
-        """Offer a flight's null collision to the reservoir, with the resampling weight `NullCollision.mass`."""
+        """Offer the null collision of a step to the reservoir. Its resampling weight is `NullCollision.mass`."""
         ray, null = path.at.ray, step.kept.media.flight.null
         active = path.active & dr.any(path.β != 0)
         mass = self.mass + dr.select(active, null.mass, 0)
@@ -66,7 +66,8 @@ def branch_term(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ra
     """Return a term whose derivative is the branch's contribution to the derivative of the radiance (Spectrum).
 
     Only the derivative of the term is meaningful. The extra path is detached, and takes time and wavelengths from the
-    camera ``ray``. Differentiable in the coefficients of the medium. The caller resumes gradients (`dr.resume_grad`).
+    camera ``ray``. The term is differentiable in the coefficients of the medium. The caller must resume gradients
+    (`dr.resume_grad`).
     """
     onward = replace(trace, branching=None)
     active = branch.mass > 0

@@ -58,7 +58,7 @@ def pixel_sweep(
     `sweep` describes ``lost``, the errors, and what is not differentiated.
     """
     room, size = room_for(trace), numbers.together(paths)
-    total = mi.Spectrum(0)  # radiance of all paths
+    total = mi.Spectrum(0)  # sum of the radiances of all paths
     with dr.suspend_grad():
         sampler = numbers.first()
         ray0, _ = camera(sampler.clone(), mi.Bool(True))

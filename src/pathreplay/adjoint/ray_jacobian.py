@@ -23,9 +23,9 @@ from pathreplay.transport.path import PathState
 from pathreplay.transport.step import repeat_step
 from pathreplay.transport.vertex import Arrival, TraceConfig, VertexRecord, VertexSamples, reciprocal
 
-# Noise is added where `independence` is below this value. Independence is zero up to float32 rounding (1e-7) for smooth
-# lobes whose direction follows the next hit point, and above 1e-3 for mirrors, glass and attached rough metal. In
-# float64, matrices with an independence of 1e-4 can be inverted accurately.
+# Noise is added where `independence` is below this value. At a smooth lobe whose sampled direction follows the next hit
+# point, independence is zero up to float32 rounding (1e-7). At mirrors, glass and attached rough metal, independence is
+# above 1e-3. In float64, matrices with an independence of 1e-4 can be inverted accurately.
 ILL_CONDITIONED = 1e-4
 
 
@@ -48,7 +48,8 @@ class Recovery:
     def regularised(self, A: mi.Matrix4f, sign: mi.Float, smooth: mi.Bool) -> mi.Matrix4f:
         """Return A + ε X.
 
-        ``smooth`` marks the lanes in which a smooth lobe was sampled. This class ignores the mask.
+        ``smooth`` marks the lanes in which a smooth lobe was sampled. This class ignores
+        the mask, but a subclass may use it.
         """
         ε = dr.select(independence(A) >= ILL_CONDITIONED, 0, type(A[0, 0])(self.noise * sign))
         return A + type(A)(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, ε, 0, 0, 0, 0, ε)
@@ -83,9 +84,10 @@ class RayFrame:
 
 @dataclass
 class Slope:
-    """Derivatives of δL·β e, where e is the emission at a vertex, with respect to two properties of the arriving ray.
+    """Derivatives of δL·β e with respect to the density and to the origin of the ray that arrives at a vertex.
 
-    The four coordinates of the ray do not contain these properties.
+    Here e is the emission at the vertex. The origin moves along the ray. Neither the density nor this motion changes
+    the four coordinates of the ray.
     """
 
     pdf: mi.Float  # derivative with respect to the density of the ray
@@ -126,9 +128,9 @@ def length_scale(scene: mi.Scene) -> float:
 
 
 def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
-    """Differentiate weight·e, where e is the emission at ``at``, with respect to the two ray properties of `Slope`.
+    """Differentiate weight·e, where e is the emission at ``at``, with respect to the density and the origin of the ray.
 
-    The ``weight`` is a constant.
+    The ``weight`` is a constant. The origin moves along the ray (see `Slope`).
     """
     if not has_smooth_lobes(trace):
         return Slope(mi.Float(0), mi.Float(0))
@@ -178,7 +180,7 @@ def local_terms(
 def linearise(
     trace: TraceConfig, v: VertexRecord, onward: PathState, δL: mi.Spectrum, scale: float, active: mi.Bool
 ) -> Linearised:
-    """Differentiate `local_terms` with respect to the four coordinates of the ray, and to nothing else.
+    """Differentiate `local_terms` with respect to the four coordinates of the ray; parameters are constants.
 
     ``onward`` is the path at the next vertex, and ``scale`` the unit of length. Both passes of attached replay call
     this function, so that the values of the two passes agree to the last bit.
@@ -187,7 +189,7 @@ def linearise(
     frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
     columns = []
     for k in range(4):
-        # One graph per column: traversing a graph twice crashes the process (Dr.Jit 1.5, virtual calls in a loop).
+        # Each column has its own AD graph: Dr.Jit 1.5 crashes if a graph of virtual calls in a loop is traversed twice.
         x = [mi.Float(0) for _ in range(4)]
         x[k] = _unit_tangent(0)
         with dr.resume_grad(x[k]):

@@ -52,7 +52,7 @@ def deepest(trace: TraceConfig, device: Device | None = None) -> int:
 
 
 def largest_record(trace: TraceConfig) -> int:
-    """Return the bytes per vertex of the larger of the two layouts, for static and for moving paths."""
+    """Return the bytes per vertex of the larger layout: static paths and moving paths have different layouts."""
     return max(_bytes(Layout.of(trace, moves)) for moves in (False, True))
 
 
@@ -78,7 +78,7 @@ class Layout:
 
     variant: str
     moves: bool  # the path moves with the parameters
-    resamples: bool  # BSDFs are sampled again in later passes
+    resamples: bool  # the passes that read the records sample BSDFs again
     fixed: bool  # radiance from emitters is recorded as a value, and rays that leave the scene have no vertex
     glows: bool  # emission at vertices is recorded: ``fixed`` is true, and some emitter is a surface
     media: bool
@@ -87,11 +87,11 @@ class Layout:
     passes: bool
     branch: bool
     splits: bool  # the paths omit caustics: see `TraceConfig.without_caustics`
-    always: bool = True  # condition of the fields that every record contains
+    always: bool = True  # always true: in `FIELDS` and `BITS`, it marks the fields that every record contains
 
     @property
     def varies(self) -> bool:
-        """Whether later passes evaluate emitters again."""
+        """Whether the passes that read the records evaluate emitters again."""
         return not self.fixed
 
     @staticmethod
@@ -107,8 +107,8 @@ class Layout:
         )
 
 
-# Each entry has a field of `VertexRecord`, the type of the field in Mitsuba, and a property of `Layout`. The field is
-# recorded if the property is true.
+# Each entry names a field of `VertexRecord`, the field's type in Mitsuba, and a property of `Layout`. The field is
+# recorded if this property is true.
 FIELDS = (
     ("at.ray.o", "Point3f", "always"),
     ("at.ray.d", "Vector3f", "always"),
@@ -214,7 +214,7 @@ def read_back(
     if layout.fixed:
         return v
     onward = _read(layout, records[dr.minimum(index + 1, last)], ray0).at
-    # The record of the next vertex contains the continuation of this vertex.
+    # The record of the next vertex contains the direction in which the path continues at this vertex.
     kept = replace(v.kept, d=onward.ray.d, delta=onward.delta)
     if layout.passes:
         kept.delta |= kept.media.null

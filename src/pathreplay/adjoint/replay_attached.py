@@ -5,7 +5,7 @@ The first pass stores L_0 and q_0 = δL·∂L_0/∂r_0. The second pass ("peelin
     β_{i+1} L_{i+1} = β_i L_i - β_i e_i,      (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i,      A_i = ∂r_{i+1}/∂r_i,
 
 where p_i = δL·∂(β_i e_i + β_i w_i L_{i+1})/∂r_i at fixed L_{i+1}. `Recovery` describes the noise ε_i X_i. The noise has
-mean zero, and the first pass uses the same A_i + ε_i X_i, so that the expectation of q_0 is unchanged. This is the
+mean zero. Both passes use the same A_i + ε_i X_i, so that the noise does not change the expectation of q_0. This is the
 attached estimator of Vicini, Speierer and Jakob (2021). The sweep driver computes q without inverting a matrix.
 """
 
@@ -93,7 +93,7 @@ def _peel(
     """Run the second pass: compute L and q of each ray in turn, and back-propagate into the parameters."""
     δL, L, q, overflow = peeled.δL, peeled.L, peeled.q, peeled.overflow
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
-    broken = mi.Bool(False)  # this path has been counted as lost
+    broken = mi.Bool(False)  # true once ``lost`` has counted the path
 
     while dr.hint(path.active, exclude=[trace, recovery, scale, lost], label="pathreplay: replay"):
         u, step = path.choose(trace, sampler)

@@ -29,11 +29,12 @@ def record_path(
 ) -> tuple[dr.Local[object], mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
     """Record a path; ``first`` is the index of its first record.
 
-    Returns the records, their number, the radiance of the path, the radiance that arrives at the last recorded vertex
-    from the environment, and the `Branch`. The fourth value does not include the throughput, and is zero unless
-    ``layout.fixed``. ``lost`` counts the paths that were truncated because the record was full.
+    Returns five values: the records, their number, the radiance L of the path, the radiance that arrives at the last
+    recorded vertex from the environment, and the `Branch`. L includes the throughput, and the radiance from the
+    environment does not. The radiance from the environment is zero unless ``layout.fixed``. ``lost`` counts the paths
+    that were truncated because their record was full.
 
-    All lanes of a packet must write to the same index. Otherwise writes to local memory are lost (Dr.Jit 1.5).
+    All lanes of a packet must write to the same index. Otherwise Dr.Jit 1.5 loses writes to local memory.
     """
     trace = replace(trace, background_apart=layout.fixed)
     L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance of the path so far; radiance from the environment
@@ -102,7 +103,7 @@ def sweep_path(
     """
     layout, records, first, count, last = path.layout, path.records, path.first, path.count, path.last
     ray0, δL, L, q = path.ray0, adjoint.δL, adjoint.L, adjoint.q
-    broken = mi.Bool(False)  # a part of the adjoint was not finite
+    broken = mi.Bool(False)  # the adjoint of a ray was not finite
 
     while dr.hint(count > 0, exclude=[trace, layout, ray0, lost, seen, rays_only], label="pathreplay: sweep"):
         count -= 1

@@ -1,13 +1,16 @@
 """Arcs of directions around a vertex, on which edges between surfaces are searched: see `crofton`.
 
-An arc contains a BSDF sample d, drawn with density p. If d were always the centre of the arc, the variance would be
-practically unbounded for lobes that are narrower than the arc: beside a lobe, p is low, but the arc may contain the
-peak of the lobe, at which the BSDF is many thousand times p. The sample d therefore lies at one of n positions d_i of
-the arc, selected at random. The density of the arc is the mean of p(d_i). This mean accounts for all lobes that are
-wider than the spacing of the d_i. Narrower lobes need shorter arcs. The length l_j is selected with probability P_j(p).
-An edge that crosses the arc in direction z has the weight
+Each arc contains a BSDF sample d, drawn with density p(d). If d were always the centre of the arc, the variance would
+be practically unbounded for lobes that are narrower than the arc. The centre of such an arc may lie beside a lobe,
+where p is low, while the arc contains the peak of the lobe, at which the BSDF is many thousand times p. The sample d
+therefore lies at one of n positions d_i of the arc, selected at random. The density of the arc is the mean of p(d_i)
+over all i. This mean is large enough for all lobes that are wider than the spacing of the d_i. Narrower lobes need
+shorter arcs. An arc has the length l_j with probability P_j(p(d)). The point at which an edge crosses the arc is a
+direction z. The weight of the edge is
 
-    a_j(z) / (l_j · mean p(d_i) P_j(p(d_i))),        a_j ∝ l_j P_j min(1, p_j / p(z)),        Σ_j a_j = 1,
+    a_j(z) / (l_j · m_j),        m_j = mean over i of p(d_i) P_j(p(d_i)),
+
+    a_j(z) ∝ l_j P_j(p(z)) min(1, p_j / p(z)),        Σ_j a_j(z) = 1,
 
 where p_j is the largest density for which arcs of length l_j are short enough. The expectation, summed over all
 lengths, is correct for any a_j with sum 1. The expectation is also correct for every position of d on the arc, because
@@ -53,11 +56,11 @@ class Arc:
     p: mi.Float  # density of the sampled direction
     f: mi.Spectrum  # scattering of light from the sampled direction
     active: mi.Bool  # the sample is valid
-    j: mi.UInt32 | None  # index of the length; None: all arcs have the same length, and the sample is the centre
+    j: mi.UInt32 | None  # index of the length; None if all arcs have one length and are centred at their samples
 
     @classmethod
     def draw(cls: type[A], observer: ObserverVertex, l: float, narrow: bool, key: mi.UInt32, active: mi.Bool) -> A:
-        """Draw an arc of at most ``l`` radians, or of exactly ``l`` if no lobe may be ``narrow``."""
+        """Draw an arc. It has at most ``l`` radians if lobes may be ``narrow``, and otherwise exactly ``l`` radians."""
         sampler = CounterSampler.stream(key, Stream.ARC)
         (lobe, u_mode), turn = sampler.next_2d(), dr.two_pi * sampler.next_1d()
         d, smooth = observer.sample(lobe, sampler.next_2d())
@@ -81,7 +84,7 @@ class Arc:
         return self.c * dr.cos(t) + self.w * dr.sin(t)
 
     def weight(self, pdf: mi.Float, active: mi.Bool) -> mi.Float:
-        """Return the weight of an edge that crosses the arc in a direction with the BSDF sampling density ``pdf``."""
+        """Return the weight of an edge; ``pdf`` is the BSDF's density in the direction at which it crosses the arc."""
         if self.j is None:
             return dr.rcp(self.length * self.p)
         p = density_of_samples(pdf)
@@ -104,10 +107,7 @@ class Arc:
         return total
 
     def importance(self) -> mi.Float:
-        """Estimate the ratio of two weights of a crossing.
-
-        The first weight is the actual weight. The second is the weight if all arcs had the largest length.
-        """
+        """Estimate the weight of an edge on this arc, relative to its weight if all arcs had the largest length."""
         return mi.Float(1) if self.j is None else _suitability(self.p, self.j) / _normalization(self.p)
 
 
@@ -129,12 +129,12 @@ def probability(p: mi.Float, j: mi.UInt32) -> mi.Float:
 
 
 def _position(i: mi.UInt32) -> mi.Float:
-    """Return the i-th possible position of the sample, as its distance from the centre in arc lengths."""
+    """Return the i-th possible position of the sample on the arc, between -1/2 and 1/2 (the two ends of the arc)."""
     return (mi.Float(i) + 0.5) / POSITIONS - 0.5
 
 
 def _level(p: mi.Float) -> mi.Float:
-    """Return the real number j at which p_j = `BROAD` · 2^(4j) equals p, clipped to the range of the indices."""
+    """Return the index j, as a real number, for which p_j = `BROAD` · 2^(4j) equals p; clipped to [0, LENGTHS - 1]."""
     return dr.clip(dr.log2(p / BROAD) / 4, 0, LENGTHS - 1)
 
 
@@ -144,14 +144,14 @@ def _length(j: mi.UInt32) -> mi.Float:
 
 
 def _suitability(p: mi.Float, j: mi.UInt32) -> mi.Float:
-    """Return the factor min(1, p_j / p) of a_j. The factor is small for arcs that are too long.
+    """Return min(1, p_j / p), which is small if arcs of length l_j are too long for the density ``p``.
 
-    For the shortest arcs, the factor is 1.
+    For the shortest arcs, the result is always 1.
     """
     return dr.select(j == LENGTHS - 1, 1, dr.minimum(1, BROAD * dr.exp2(4 * mi.Float(j)) / p))
 
 
 def _normalization(p: mi.Float) -> mi.Float:
-    """Return Σ_j l_j P_j min(1, p_j / p), the divisor of all a_j, for lengths l_j relative to the largest length."""
+    """Return Σ_j l_j P_j(p) min(1, p_j / p), by which all a_j are divided. The unit of l_j is the largest length."""
     levels = map(mi.UInt32, range(LENGTHS))
     return sum((_length(j) * probability(p, j) * _suitability(p, j) for j in levels), mi.Float(0))

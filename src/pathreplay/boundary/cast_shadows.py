@@ -1,8 +1,9 @@
-"""Find film positions at which moving shapes may cast shadows. These positions only guide the pilot pass.
+"""Find film positions at which moving shapes may cast shadows.
 
-The shadow of a small object covers few pixels, and few segments would cross its boundary. Rays are therefore traced
-from points on moving shapes, away from the light. Behind the shape, a ray hits the surface on which the shadow may
-fall. Whether the camera sees this surface is not tested.
+The pilot pass of `SecondarySearch` concentrates some of its boundary segments at these positions. The shadow of a small
+object covers few pixels, and few uniformly distributed segments would cross its boundary. To find the shadow, rays are
+traced from points on moving shapes, away from the light. Behind the shape, a ray hits the surface on which the shadow
+may fall. Whether the camera sees this surface is not tested.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def casters(trace: TraceConfig) -> list[mi.Shape]:
 def cast_shadows(
     trace: TraceConfig, shapes: list[mi.Shape], film: FilmDomain, seed: mi.UInt32
 ) -> tuple[mi.Point2f, mi.Bool]:
-    """Return `RAYS` film positions, and whether a shadow of one of the shapes may fall there."""
+    """Return `RAYS` film positions, and for each position whether a shadow of one of the shapes may fall on it."""
     sampler = CounterSampler.of(key_of(dr.arange(mi.UInt32, RAYS), seed))
     index, u = dr.minimum(mi.UInt32(sampler.next_1d() * len(shapes)), len(shapes) - 1), sampler.next_2d()
     u_face = sampler.next_1d()

@@ -1,7 +1,8 @@
-"""Chains, the parts of camera paths that pass only through delta lobes: probe, compare and record them.
+"""Probes, compares and records chains. A chain is the part of a camera path that passes only through delta lobes.
 
-Neighbouring chains share their random numbers, and therefore usually select the same lobes. If they select different
-lobes because the selection probabilities differ, there is no edge: the difference is due to sampling.
+Two neighbouring chains use the same random numbers, and therefore usually select the same lobes. If a lobe is selected
+with different probabilities on the two chains, the chains may continue along different lobes of the same surface. Such
+a difference is due to sampling, and no edge lies between the chains.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
 def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> VisibilityProbe:
     """Probe a path from the camera to its first vertex without a delta lobe.
 
-    Vertices before the first surface that may move are ignored. In lanes with ``flows`` (see `FilmDomain`), the camera
-    ray may move, so that all surfaces count as moving.
+    Vertices before the first surface that may move are not compared. In lanes with ``flows`` (see `FilmDomain`), the
+    camera ray may move, so that all surfaces count as moving.
     """
     sampler = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
@@ -91,7 +92,7 @@ def _probe_vertex(trace: TraceConfig, path: PathState, key: mi.UInt32, active: m
 def _scattered(
     trace: TraceConfig, path: PathState, si: mi.SurfaceInteraction3f, key: mi.UInt32, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Return the directions of the emitter sample and of the BSDF sample; zero for a sample of weight zero."""
+    """Return the directions of the emitter sample and of the BSDF sample. If a sample has weight 0, return 0 for it."""
     u, ctx = VertexSamples.draw(CounterSampler.at_vertex(key, path.depth)), mi.BSDFContext()
     light, lit = sample_light(trace, si, u.light, path.depth, active)
     lobe, weight = si.bsdf().sample(ctx, si, u.lobe, u.direction, active & si.is_valid())
@@ -114,12 +115,12 @@ def _shadow_test(trace: TraceConfig, at: Arrival, key: mi.UInt32, k: mi.UInt32, 
 class ChainSplit:
     """The vertex at which two neighbouring chains diverge."""
 
-    k: mi.UInt32  # number of vertices before this one, which both chains share
+    k: mi.UInt32  # number of vertices that the two chains have in common before they diverge
     a: Arrival
     b: Arrival
     β: mi.Spectrum  # throughput before the vertex
     parted: mi.Bool  # the chains diverge
-    shadows: tuple[ShadowTest, ShadowTest] | None = None  # None without lights that cast hard shadows
+    shadows: tuple[ShadowTest, ShadowTest] | None = None  # None if no light of the scene casts hard shadows
 
 
 @dr.syntax
@@ -166,7 +167,7 @@ def record_chain(
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
     count = mi.UInt32(0)
     while dr.hint(path.active & (count <= k), exclude=[trace, layout], label="pathreplay: record chain"):
-        path.active &= count < k  # The path ends at record k. Only the `Arrival` in this record is read later.
+        path.active &= count < k  # the last record has index k; only its `Arrival` is read later
         u, step = path.choose(trace, sampler)
         onward, v = path.advance(trace, u, step)
         records[count] = record(layout, v)

@@ -1,6 +1,8 @@
-"""Edges other than outlines: surface contacts, hard shadow boundaries, lines where smooth shading turns black.
+"""Creases: edges at which no surface occludes another.
 
-A smooth-shaded mesh turns black where its shading normal is perpendicular to the ray, slightly before its outline.
+There are three kinds of creases. At a contact, two surfaces meet. The second kind is the boundary of a hard shadow. The
+third is a line at which a smooth-shaded mesh turns black, because its shading normal becomes perpendicular to the ray.
+This line lies slightly inside the outline of the mesh.
 """
 
 from __future__ import annotations
@@ -32,17 +34,17 @@ Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
 
 @dataclass
 class Crease:
-    """Edge other than an outline between the hits of two rays: surface contact, hard shadow, or black shading."""
+    """The crease between the hits of two rays. It is of one of the three kinds that the module describes."""
 
     a: mi.PreliminaryIntersection3f
     b: mi.PreliminaryIntersection3f
     meets: mi.Bool  # two surfaces are in contact, at an angle
     turns: mi.Bool  # the hits are on one sheet, and only one of their shading normals faces the ray
-    shadow: HardShadow | None  # None without lights that cast hard shadows
+    shadow: HardShadow | None  # None if no light of the scene casts hard shadows
 
     @staticmethod
     def of(trace: TraceConfig, side_a: Side, side_b: Side, shadow: HardShadow | None, active: mi.Bool) -> Crease:
-        """Classify the edge between two hits. Detached."""
+        """Classify the edge between two hits. The result is detached."""
         (a, ray_a), (b, ray_b) = side_a, side_b
         both = active & a.is_valid() & b.is_valid()
         if shadow is not None:
@@ -56,12 +58,15 @@ class Crease:
 
     @property
     def exists(self) -> mi.Bool:
-        """Whether there is an edge other than an outline."""
+        """Whether a crease lies between the two hits."""
         exists = self.meets | self.turns
         return exists if self.shadow is None else exists | self.shadow.exists
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        """Evaluate B, which is zero on the edge and in lanes without an edge. Differentiable in ray and shapes."""
+        """Evaluate B, which is zero on the crease. B is also zero in lanes without a crease.
+
+        B is differentiable in the ray and in the shapes.
+        """
         meets, turns = active & self.meets, active & self.turns
         t = [hit.compute_surface_interaction(ray, compat.shading(), meets).t for hit in (self.a, self.b)]
         si = self.a.compute_surface_interaction(ray, compat.shading(), turns)
@@ -70,12 +75,13 @@ class Crease:
 
 
 def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> list[Arrival]:
-    """Return the arrivals on the two sides of an edge, moved apart where two surfaces form a concave corner.
+    """Return the arrivals on the two sides of an edge. In a concave corner of two surfaces, the hits are moved apart.
 
-    The origin of a ray is offset from the surface on which the ray starts. If a hit is closer to a contact line than
-    this offset, the origin of the next ray lies behind the other surface. Rays from below a floor, for example, would
-    reach the sky. Radiance is continuous along each surface. The error of moving the hits is therefore proportional to
-    the distance by which the hits move. This distance is some thousandths of the size of objects.
+    The origin of a ray is offset from the surface on which the ray starts. If a hit is closer to the corner than this
+    offset, the origin of the next ray lies behind the other surface. For example, the origin could lie below the floor,
+    and the ray would miss the floor. The moved hits cause a small error. Radiance is continuous along each surface, so
+    that the error is proportional to the distance by which the hits move. This distance is some thousandths of the size
+    of objects.
     """
     sides = [(at, at.hit.compute_surface_interaction(at.ray, compat.minimal(), active)) for at in (a, b)]
     normals = [dr.select(dr.dot(si.n, at.ray.d) > 0, -si.n, si.n) for at, si in sides]

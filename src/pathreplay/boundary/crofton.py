@@ -5,9 +5,10 @@ p(c) be the density of their centres, and let their directions be uniform. The e
 crossings with edges is 2 l / π times the integral of g along the edges. Different signatures (hashes of the visible
 surfaces) at the ends of a segment indicate a crossing; bisection locates it.
 
-If a segment has two crossings, for example at a corner, the signatures at its ends may be equal. Each segment is
-therefore also probed in the middle. Two crossings on the same side of the middle are still missed. In compensation, a
-segment has a larger weight if its ends have equal signatures and only its middle differs: see `middle_weight`.
+If a segment has two crossings, for example at a corner, the signatures at its two ends may be equal. Each segment is
+therefore also probed in the middle. Two crossings on the same side of the middle are still missed. Other segments make
+up for the missed crossings: if the two ends have the same signature, and the middle has a different signature, the
+weight of the segment is larger (see `middle_weight`).
 """
 
 from __future__ import annotations
@@ -45,16 +46,16 @@ of an emitter this distance is less than `emitters.BORDER`."""
 
 @dataclass
 class VisibilityProbe:
-    """Visibility at one position of a segment. If two probes differ, an edge lies between them."""
+    """Visibility at one position of a segment. If two probes differ, an edge lies between their positions."""
 
     signature: mi.UInt32
     p: mi.Point3f  # the visible point; zero if no surface is visible
     n: mi.Normal3f
     moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # may move; edges between static points are ignored
-    # Factors of the importance of an adjacent edge that can be estimated from a single probe:
+    # Two factors of the importance of an edge next to the probe. A single probe suffices to estimate these factors:
     near: mi.Float = field(default_factory=lambda: mi.Float(1))  # reciprocal distance of the visible point
     bright: mi.Float = field(default_factory=lambda: mi.Float(1))  # estimate of the radiance
-    # For coarse meshes with smooth shading, where the plane of a triangle may occlude light:
+    # Used for coarse meshes with smooth shading. The plane of a triangle of such a mesh may occlude light:
     triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 1 + index of the visible triangle; 0: none
     light: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the emitter sample, or zero
     lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the BSDF sample, or zero
@@ -79,9 +80,9 @@ class VisibilityProbe:
     def _crease(self, other: VisibilityProbe) -> mi.Bool:
         """Return whether different triangles are visible, and a sampled direction lies between their planes.
 
-        Only one of the triangles occludes such a direction. Directions close to a plane count as well, because sampled
-        directions turn with the shading normal between the probe and the crease. They turn by at most the angle between
-        the triangles.
+        Only one of the two triangles occludes such a direction. A direction that is merely close to one of the planes
+        counts as well. The sampled direction turns with the shading normal from the probe to the crease, by at most the
+        angle between the triangles, and may lie between the planes at the crease.
         """
         between = mi.Bool(False)
         for d in (self.light, self.lobe, other.light, other.lobe):
@@ -96,10 +97,10 @@ def at_an_angle(n: mi.Normal3f, n_other: mi.Normal3f) -> mi.Bool:
 
 
 def hides_itself(a: VisibilityProbe | mi.SurfaceInteraction3f, b: VisibilityProbe | mi.SurfaceInteraction3f) -> mi.Bool:
-    """Return whether two points of one shape may lie on different sheets: one is off the tangent plane of the other.
+    """Return whether two points of one shape may lie on different sheets, so that the shape occludes itself.
 
-    The result is also true if the shape is merely curved between the points. Curvature and different sheets can be
-    distinguished only by points that are closer to each other.
+    The result is true if one point is off the tangent plane of the other point. This is also the case if the shape is
+    merely curved between the points. To distinguish the two cases, the points would have to be closer to each other.
     """
     across = b.p - a.p
     off = dr.maximum(dr.abs(dr.dot(a.n, across)), dr.abs(dr.dot(b.n, across)))
@@ -138,15 +139,15 @@ class Bracket:
     weight: mi.Float  # number of crossings that the interval represents; 0: no edge
 
     def per_length(self, length: mi.Float | float, density: mi.Float) -> mi.Float:
-        """Return the Crofton weight, the number of crossings times π/2 / (l p(c)).
+        """Return the number of crossings times π/2 / (l p(c)), with l the ``length`` and p(c) the ``density``.
 
-        The factor π/2 / (l p(c)) is the length of edge per crossing.
+        By Crofton's formula, each crossing represents an edge of length π/2 / (l p(c)).
         """
         return 0.5 * dr.pi * self.weight / (length * density)
 
 
 def crossing_weight(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi.Spectrum:
-    """Return K = jump · sgn(w·∂B) / |∂B|, where ∂B is ``slope`` and w the direction of the jump; 0 if not finite."""
+    """Return K = jump · sgn(w·∂B) / |∂B|, where ∂B is ``slope`` and w the direction of the segment; 0 if not finite."""
     n = dr.norm(slope)
     K = jump * (dr.sign(dr.dot(w, slope)) / n)
     return dr.select((n > 0) & dr.all(dr.isfinite(K)), K, 0)
@@ -165,8 +166,8 @@ class Survey:
         """Summarise the probes at `probe_positions`."""
         a, b, c = probes
         ends, halves = a.edge_importance(b), dr.maximum(c.edge_importance(a), c.edge_importance(b))
-        # If the probes at the ends are equal and only the probe in the middle differs, the weight is about 4. A factor
-        # of 2 arises because `bisect` selects one of two crossings. `middle_weight` is another factor of about 2.
+        # If the probes at the ends are equal and the probe in the middle differs, the segment has a weight of about 4.
+        # One factor of 2 arises because `bisect` selects one of two crossings. `middle_weight` is also about 2.
         presence = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
         near = dr.maximum(dr.maximum(a.near, b.near), c.near)
         bright = dr.maximum(dr.maximum(a.bright, b.bright), c.bright)
@@ -184,14 +185,15 @@ def detect(probe: Probe, length: mi.Float, active: mi.Bool) -> mi.Float:
 
 
 def middle_weight(m: mi.Float) -> mi.Float:
-    """Return the weight of a segment whose ends have equal probes, and whose probes differ on a part around its middle.
+    """Return the weight of a segment whose two ends have equal probes, but whose middle has a different probe.
 
-    ``m`` is the length of this part, divided by the length of the segment. Suppose that the segment is shifted along
-    its own line, and that shifts are measured in lengths of the segment. In a range of shifts of size 1 - m, the
-    segment contains the whole part. The part is detected only if the middle of the segment also lies in the part, which
-    holds in a range of size min(m, 1 - m). The weight is the ratio of the two sizes, which is unbounded for small m.
-    Below `MIN_FRACTION`, the weight is therefore constant. The constant gives the correct expectation at corners, where
-    all m are equally likely.
+    The probe differs on an interval around the middle. ``m`` is the length of this interval, divided by the length l of
+    the segment. The weight compensates for segments that contain such an interval beside their middle: these segments
+    do not detect the interval. Suppose that a segment is shifted along its own line. The segment contains the whole
+    interval for a range of shifts of size (1 - m) l. In addition, the middle of the segment lies in the interval for a
+    range of size min(m, 1 - m) l. The weight is the ratio of the two sizes. This ratio is unbounded for small m. The
+    weight is therefore constant for all m below `MIN_FRACTION`. The constant gives the correct expectation at corners,
+    where all m are equally likely.
     """
     return dr.select(m < MIN_FRACTION, 2 / MIN_FRACTION - 1, dr.select(m < 0.5, (1 - m) / m, 1))
 
@@ -200,11 +202,11 @@ def middle_weight(m: mi.Float) -> mi.Float:
 def middle_fraction(
     probe: Probe, length: mi.Float, at_a: VisibilityProbe, at_b: VisibilityProbe, active: mi.Bool
 ) -> mi.Float:
-    """Return the length of the part around the middle of a segment that differs from the ends of the segment.
+    """Return the length of the interval around the middle of a segment in which probes differ from the ends.
 
-    A position belongs to the part if its probe differs from the probe at one of the ends. The part may contain further
-    edges. The result is a fraction of the length of the segment. In each half of the segment, the error is at most 1/16
-    of this half.
+    A position belongs to the interval if its probe differs from the probe at one of the ends. The interval may contain
+    further edges. The result is a fraction of the length of the segment. In each half of the segment, the error is at
+    most 1/16 of this half.
     """
     half = 0.5 * length
     n, fraction, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
@@ -223,12 +225,13 @@ def middle_fraction(
 
 @dr.syntax
 def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32) -> Bracket:
-    """Bisect each segment of non-zero ``weight`` to an interval with an edge, 2^-12 as long as the segment.
+    """Bisect each segment of non-zero ``weight``. The result is an interval that contains an edge.
 
-    If a segment has several crossings, one is selected with a probability proportional to its importance, and the
-    weight is divided by this probability. If the ends of a segment have equal probes, the weight is multiplied by
-    `middle_weight`. The weight becomes 0 where a surface is merely curved, and at cracks between triangles, through
-    which few rays pass. A crack is assumed if one end of the interval stays fixed, and a probe just beyond this end
+    The length of the interval is 2^-12 of the length of the segment. If a segment has several crossings, one is
+    selected with a probability proportional to its importance, and the weight is divided by this probability. If the
+    ends of a segment have equal probes, the weight is multiplied by `middle_weight`. The weight becomes 0 where a
+    surface is merely curved. It also becomes 0 at a crack between triangles, through which few rays pass. A crack is
+    assumed if many successive bisections have left one end of the interval unchanged, and a probe just beyond this end
     equals the probe at the other end.
     """
     a, b, _ = probe_positions(length)

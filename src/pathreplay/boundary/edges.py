@@ -6,9 +6,9 @@ contribution of the edge to the derivative of the radiance at film position s is
     - Σ K dB/dπ,
 
 summed over the crossings of boundary segments with the edge. K is the weight of a crossing (`Crossing.weight`). A lane
-has one crossing in `primary` and `volumetric`, and up to three in `secondary`. Reverse mode propagates the adjoint of
-the ray towards the edge back to the camera, along the records of the path. Forward mode propagates the tangent of the
-camera ray to the edge.
+has one crossing in `primary` and `volumetric`, and up to three in `secondary`. The last ray of the path leads to the
+edge. Reverse mode computes the adjoint of this ray, and propagates the adjoint along the records of the path to the
+camera ray. Forward mode propagates the tangent of the camera ray to the last ray.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class FilmDomain(Protocol):
     def ray(self, s: mi.Point2f, key: mi.UInt32) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Return the camera ray through a film position, and its weight (Spectrum).
 
-        Both are attached to the camera and to ``s`` if these have gradients. ``key`` determines all other random
-        properties of the ray (time, wavelengths, aperture).
+        Ray and weight are attached to the camera and to ``s`` if these have gradients. ``key`` determines all other
+        random properties of the ray (time, wavelengths, aperture).
         """
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
@@ -67,7 +67,7 @@ class Crossing(Protocol):
     weight: mi.Spectrum  # K, zero without an edge
 
     def gap(self, at: Any) -> mi.Float:
-        """Evaluate B, the function that is zero on the edge. Differentiable in the shapes and in ``at``.
+        """Evaluate B, which is zero on the edge. B is differentiable in the shapes and in ``at``.
 
         ``at`` is the vertex that sees the edge (`ObserverVertex.moved`). For edges on the film, which have no observer,
         ``at`` is the last ray of the path.
@@ -95,7 +95,7 @@ class Edges:
     observer: ObserverVertex | None  # the vertex that sees the edge; None for edges on the film
 
     def motion(self, ray: mi.Ray3f) -> mi.Spectrum:
-        """Evaluate - Σ K B over all crossings (Spectrum). Differentiable in the path's last ``ray`` and the shapes."""
+        """Evaluate - Σ K B over all crossings (Spectrum), differentiable in the path's last ``ray`` and the shapes."""
         at = ray if self.observer is None else self.observer.moved(ray)
         return -reduce(add, [crossing.weight * crossing.gap(at) for crossing in self.crossings])
 
@@ -108,8 +108,8 @@ def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spe
     with dr.resume_grad():
         ray, _ = film.ray(path.s, path.key)
         if dr.grad_enabled(ray.o, ray.d):
-            # Each camera parameter has a separate sum over these values. If the values were not evaluated here, every
-            # sum would repeat the search.
+            # The gradient of each camera parameter is a separate sum over q. Without this evaluation, each sum would
+            # repeat the edge search.
             dr.eval(q, path.s, path.key)
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
 
@@ -139,9 +139,9 @@ def ray_to_camera(
     lost: NonFiniteCounter,
     rays_only: bool = False,
 ) -> RayDerivative:
-    """Propagate the adjoint ``q`` of the ray towards the edge back to the camera ray.
+    """Return the adjoint of the camera ray, given the adjoint ``q`` of the path's last ray, which leads to the edge.
 
-    With ``rays_only`` no parameter receives a gradient.
+    With ``rays_only``, no parameter receives a gradient.
     """
     k, none = path.k, mi.Spectrum(0)
     ray0 = dr.detach(film.ray(path.s, path.key)[0])

@@ -1,14 +1,15 @@
 """Shadow edges in the domain of emitter samples: the emitter is visible on one side and occluded on the other.
 
-Segments lie in a unit square. For most emitters this is the square of their random numbers. Two kinds differ:
+Segments lie in a unit square. For most emitters, a position in the square is the pair of random numbers with which the
+emitter is sampled. Two kinds of emitters are exceptions:
 
 - A sphere samples directions in polar coordinates. Close to the pole, straight edges have unbounded curvature in these
   coordinates, and segments cannot resolve them. The square is therefore mapped to a disk first.
 - The samples of a mesh are discontinuous where they change from one triangle to the next. The square is therefore
   mapped to the cone of directions around a bounding sphere of the mesh.
 
-Both maps preserve areas up to a constant factor. They do not affect the motion of directions: when the scene moves, a
-direction follows its sampled point on the emitter, as in the interior term.
+Both maps preserve areas up to a constant factor. When the scene moves, a sampled direction follows its sampled point on
+the emitter, as in the interior term. The maps do not affect this motion.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ class EmitterProbe:
     Le: mi.Spectrum  # radiance divided by the density of the position
     density: mi.Float  # density of emitter sampling in this direction
     ray: mi.Ray3f
-    hit: mi.PreliminaryIntersection3f  # hit of the shadow ray, which may be the mesh emitter itself
+    hit: mi.PreliminaryIntersection3f  # hit of the shadow ray; may lie on the emitter if the emitter is a mesh
     hidden: mi.Bool
 
 
@@ -126,7 +127,7 @@ def direction(emitter: SampledEmitter, o: mi.Point3f, u: mi.Point2f) -> tuple[mi
 
 @dataclass
 class EmitterSegment(PlaneSegment):
-    """A segment in the unit square of one emitter (see `emitters`), reflected where it meets the margin."""
+    """A segment in the unit square of one emitter (see the module). It is reflected at the margin of the square."""
 
     observer: ObserverVertex
     key: mi.UInt32
@@ -156,7 +157,7 @@ class EmitterSegment(PlaneSegment):
         return BORDER + INSIDE * dr.select(reflected, 2 - x, x), dr.select(reflected, -self.w, self.w)
 
     def probe_emitter(self, t: mi.Float, active: mi.Bool) -> EmitterProbe:
-        """Sample the emitter at position ``t``, and trace the shadow ray. Detached."""
+        """Sample the emitter at position ``t``, and trace the shadow ray. The result is detached."""
         observer, trace, emitter, u = self.observer, self.observer.trace, self.emitter, self.at(t)
         in_cone = active & (emitter.radius > 0)
         light, Le = emitter.ptr.sample_direction(observer.origin, sample_at(trace, emitter, u), active & ~in_cone)
@@ -184,10 +185,10 @@ class EmitterSegment(PlaneSegment):
         return EmitterProbe(light, Le, density, ray, hit, _hides(hit, emitter.ptr, tested) & near)
 
     def followed(self, origin: mi.Interaction3f, u: mi.Point2f, anchor: EmitterProbe, active: mi.Bool) -> mi.Vector3f:
-        """Return the direction to position ``u`` of the emitter, differentiable in ``u``, origin and emitter.
+        """Return the direction from ``origin`` to the emitter sample at ``u``.
 
-        The ray of ``anchor`` has hit a point of the emitter. If the emitter is a mesh, the direction moves like the
-        direction from the origin to this point.
+        The result is differentiable in ``u``, in the origin and in the emitter. If the emitter is a mesh, the direction
+        moves like the direction from the origin to the point of the mesh that the ray of ``anchor`` has hit.
         """
         trace, emitter = self.observer.trace, self.emitter
         in_cone = active & (emitter.radius > 0)
@@ -241,7 +242,8 @@ class EmitterSegment(PlaneSegment):
         a, b = (self.probe_emitter(t, active) for t in (bracket.a, bracket.b))
         active &= a.hidden != b.hidden
         lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
-        active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)  # excludes the outline of a mesh emitter
+        # The outline of a mesh emitter is not a shadow edge.
+        active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)
         active &= observer.is_far(dark.hit.t)
         f, pdf = observer.towards(lit.light.d, active)
         T = observer.transmittance_past_edge(lit.light, dark.hit.t, self.key, active)
@@ -249,7 +251,8 @@ class EmitterSegment(PlaneSegment):
         jump *= bracket.per_length(self.length, mi.Float(INSIDE**-2)) * dr.select(a.hidden, -1, 1)
         active &= dr.any(jump != 0) & dr.all(dr.isfinite(jump))
         u, u_lit = (self.at(dr.select(a.hidden, *t)) for t in ((bracket.a, bracket.b), (bracket.b, bracket.a)))
-        own = active & observer.separates(lit.light.d, dark.light.d)  # not ray.d, because ray origins are offset
+        # The directions of the shadow rays themselves cannot be used, because the origins of the rays are offset.
+        own = active & observer.separates(lit.light.d, dark.light.d)
         n = edge_normal(dark.hit, dark.ray, active)
         crossing = ShadowCrossing(jump, self, u, lit, dark, n, own, active)
         return crossing.weighted(self.direction(bracket.a), u_lit)
@@ -277,9 +280,9 @@ class ShadowCrossing:
         return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, dark.hit, dark.ray, self.active))
 
     def weighted(self, w: mi.Vector2f, u_lit: mi.Point2f) -> ShadowCrossing:
-        """Replace the weight by the `crossing_weight`.
+        """Replace ``weight``, which is only the jump of the integrand in direction ``w``, by the `crossing_weight`.
 
-        Before the call, the weight is the jump in direction ``w``. ``u_lit`` is the lit end of the bisected interval.
+        ``u_lit`` is the lit end of the bisected interval.
         """
         observer, dark = self.segment.observer, self.dark
         at = observer.moved(observer.at.ray)

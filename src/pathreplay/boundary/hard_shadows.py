@@ -23,21 +23,24 @@ from pathreplay.transport.volume.passage import skip_null
 class ShadowTest:
     """Result of a shadow test, i.e. whether a light reaches a point.
 
-    A point is dark if it is occluded, outside a projector's image, or outside a spot's cone.
+    A point is dark if it is occluded, outside a projector's image, or outside the cone of a spot with a sharp cutoff.
     """
 
     u: mi.Point2f  # random numbers that select the light
-    lit: mi.Bool  # a light was sampled, and it has no extent
+    lit: mi.Bool  # a light without extent was sampled; the point may still be dark
     Le: mi.Spectrum  # radiance divided by the probability of the light
     ray: mi.Ray3f  # towards the light
     hit: mi.PreliminaryIntersection3f
-    outside: mi.Bool  # the point is outside a projector's image, or a cone without falloff
+    outside: mi.Bool  # the point is outside a projector's image, or outside the cone of a spot with a sharp cutoff
     uv: mi.Point2f  # position in the projector's image
     met: mi.PreliminaryIntersection3f | None = None  # surface hit at the tested point; None for a point in a medium
 
     @staticmethod
     def of(trace: TraceConfig, at: Arrival, sampler: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
-        """Test whether a path's k-th vertex receives light from its emitter sample; ``sampler`` is positioned there."""
+        """Test whether a path's k-th vertex receives light from its emitter sample.
+
+        ``sampler`` is positioned at the k-th vertex.
+        """
         u = VertexSamples.draw(sampler).light
         si = at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
         test = ShadowTest.at(trace, si, u, _scatters(trace, si, k, active))
@@ -68,28 +71,34 @@ class ShadowTest:
 
 @dataclass
 class HardShadow:
-    """Boundary of a hard shadow between two points, if one of them is in shadow and the other is lit."""
+    """Boundary of a hard shadow between two points. It exists if one of the points is dark and the other is not."""
 
     trace: TraceConfig
     exists: mi.Bool
-    in_a: mi.Bool  # the first point is in shadow
-    test: ShadowTest  # test of the point in shadow
+    in_a: mi.Bool  # the first point is dark
+    test: ShadowTest  # test of the dark point
     n: mi.Vector3f  # normal to the edge of the occluder: see `edge_normal`
 
     @staticmethod
     def between(trace: TraceConfig, a: ShadowTest, b: ShadowTest, active: mi.Bool) -> HardShadow:
-        """Compare two shadow tests. Detached."""
+        """Compare two shadow tests. The result is detached."""
         exists, test = active & (a.dark != b.dark), dr.select(a.dark, a, b)
         return HardShadow(trace, exists, a.dark, test, edge_normal(test.hit, test.ray, exists & ~test.outside))
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        """Evaluate B, zero on the shadow boundary, at the hit of ``ray``. Differentiable in ray, shapes and light."""
+        """Evaluate B, which is zero on the shadow boundary, at the hit of ``ray``.
+
+        B is differentiable in the ray, the shapes and the light.
+        """
         assert self.test.met is not None
         si = self.test.met.compute_surface_interaction(ray, compat.shading(), active & self.exists)
         return self.gap_at(si, active)
 
     def gap_at(self, x: mi.Interaction3f, active: mi.Bool) -> mi.Float:
-        """Evaluate B, zero on the shadow boundary, at ``x``. Differentiable in ``x``, the shapes and the light."""
+        """Evaluate B, which is zero on the shadow boundary, at ``x``.
+
+        B is differentiable in ``x``, the shapes and the light.
+        """
         test, traits, active = self.test, self.trace.traits, active & self.exists
         light, _ = self.trace.scene.sample_emitter_direction(x, test.u, False, active)
         shadow = outline_gap(self.n, x.p, light.d, test.hit, test.ray, active & ~test.outside)
@@ -112,7 +121,7 @@ def _has_sharp_cutoff(spot: mi.Emitter) -> mi.Bool:
 def _cone_gap(spot: mi.Emitter, light: mi.DirectionSample3f) -> mi.Float:
     """Return the distance of a light direction from the boundary of a spot's cone, as a difference of cosines.
 
-    Positive inside the cone. Differentiable in the direction and in the spot.
+    The result is positive inside the cone, and differentiable in the direction and in the spot.
     """
     axis = dr.normalize(spot.world_transform() @ mi.Vector3f(0, 0, 1))
     return -dr.dot(axis, light.d) - dr.cos(dr.deg2rad(mi.traverse(spot)["cutoff_angle"]))

@@ -1,8 +1,9 @@
-"""Importance of a segment, estimated from its probes: it determines which segments are bisected, but adds no bias.
+"""Importance of segments. Segments are selected for bisection in proportion to their importance, without bias.
 
-The contribution of an edge has two factors. The direction to an edge at distance r turns by 1 / r per unit of motion.
-At the edge, the integrand jumps by a fraction of the scattered radiance. The radiance of a visible surface is unknown
-before a path is traced. The importance therefore contains a constant instead: 1 for the sky, and `DIM` for any surface.
+The importance of a segment is estimated from its probes. The contribution of an edge has two factors. The direction to
+an edge at distance r turns by 1 / r per unit of motion. At the edge, the integrand jumps by a fraction of the scattered
+radiance. The radiance of the visible surfaces is unknown before a path is traced, and is replaced by a constant: 1 for
+the sky, and `DIM` for any surface.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Importance:
 
     presence: mi.Float  # see `Survey.presence`
     edges: mi.Float  # importance of the edges
-    light: mi.Float  # scattered radiance of an emitter sample, or scattering weight of an arc
+    light: mi.Float  # for an emitter sample: its scattered radiance; for an arc: its scattering weight
 
     @staticmethod
     def of(survey: Survey, light: mi.Float, scale: mi.Float) -> Importance:
@@ -53,7 +54,10 @@ def _finite(x: mi.Float) -> mi.Float:
 
 
 def closeness(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Float:
-    """Return 1 / r, the rotation of the direction to a hit per unit of motion, bounded by `WITHIN`; 0 on a miss."""
+    """Return about 1 / r for a hit at distance r, and 0 for a miss. `WITHIN` bounds the result for small r.
+
+    The direction to the hit turns by the angle 1 / r if the hit point moves by one unit of length.
+    """
     shape = dr.reinterpret_array(mi.UInt32, hit.shape)
     h0 = dr.gather(mi.Float, trace.traits.tables.blend_lengths, shape, hit.is_valid())
     return dr.select(hit.is_valid(), dr.rcp(hit.t + WITHIN * h0), 0)
@@ -74,7 +78,7 @@ def radiance_of(importances: list[Importance]) -> mi.Float:
 
 
 def weighed(importances: list[Importance], radiance: mi.Float) -> list[mi.Float]:
-    """Return the presence and the importance of edges as two arrays. Each of the two arrays has the sum 1.
+    """Return `Importance.presence` and the importance of edges as two arrays. Each of the two arrays has the sum 1.
 
     In both arrays, the segments in emitter squares precede the arcs.
     """

@@ -33,9 +33,9 @@ NEAR = 10.0
 
 
 def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool, mi.Spectrum]:
-    """Return the lanes whose vertex has a smooth lobe or is in a medium, and a weight (Spectrum).
+    """Return the lanes whose vertex has a smooth lobe or is a collision in a medium, and a weight (Spectrum).
 
-    The weight is the `Flight.weight` of the flight to the vertex.
+    The weight belongs to the sampled distance between the previous vertex and this vertex: see `Flight.weight`.
     """
     if trace.media is None:
         return surface_sees(trace, at), mi.Spectrum(1)
@@ -70,8 +70,8 @@ def choose_vertex(
     """Trace a camera path, and select one of the vertices that `may_see` an edge, in proportion to the throughput.
 
     In lanes with ``flows`` (see `FilmDomain`), the camera ray may move, so that all vertices count as moving. Vertices
-    are written to ``records`` unless ``records`` is None. The last vertex that ``trace`` allows scatters no light, and
-    is therefore not traced.
+    are written to ``records`` unless ``records`` is None. A path with `max_depth` vertices scatters no light at its
+    last vertex, which is therefore not traced.
     """
     trace = replace(trace, max_depth=max(trace.max_depth - 1, 0))
     path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)))
@@ -106,7 +106,7 @@ def choose_vertex(
 
 
 def _first_vertex(trace: TraceConfig, path: PathState, flows: mi.Bool) -> SelectedVertex:
-    """Return the first vertex, the only candidate, without tracing further."""
+    """Return the first vertex of a path. It is the only candidate, and the path is not traced further."""
     at, none = path.at, mi.UInt32(0)
     active = path.active & surface_sees(trace, at)
     return SelectedVertex(
@@ -115,7 +115,7 @@ def _first_vertex(trace: TraceConfig, path: PathState, flows: mi.Bool) -> Select
 
 
 class ObserverVertex:
-    """The vertex that sees an edge, detached; `moved` returns it with derivatives."""
+    """The vertex that sees an edge. All attributes are detached; `moved` returns the vertex with derivatives."""
 
     def __init__(self, trace: TraceConfig, vertex: SelectedVertex) -> None:
         self.trace, self.selected = trace, vertex
@@ -128,10 +128,14 @@ class ObserverVertex:
             # With a given flight, no random numbers are needed, and the sampler may be None.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # in these lanes, creases are edges
+        # In lanes with `keeps_direction`, sampled directions are fixed, and creases count as edges.
+        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
-        """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium: see `fly_again`."""
+        """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium.
+
+        A collision in a medium moves as in `fly_again`.
+        """
         si = met(self.at.hit, ray, self.active)
         if self.flight is None:
             return si
@@ -142,7 +146,7 @@ class ObserverVertex:
         return origin
 
     def towards(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
-        """Evaluate scattering of light from direction ``d`` (Spectrum), and the density of sampling ``d``."""
+        """Evaluate BSDF or phase function for light from ``d`` (Spectrum), and the density of sampling ``d``."""
         ctx, si = mi.BSDFContext(), self.si
         if self.trace.media is None:
             return si.bsdf().eval_pdf(ctx, si, si.to_local(d), active)
@@ -179,14 +183,16 @@ class ObserverVertex:
     def is_far(self, t: mi.Float) -> mi.Bool:
         """Return whether a distance is much larger than the offset of ray origins from their surface.
 
-        Closer hits have inaccurate positions or are artefacts of rounding, and their reciprocal distance is unbounded.
+        Hits at smaller distances have inaccurate positions or are artefacts of rounding. Their reciprocal distance is
+        unbounded.
         """
         return t > NEAR * mi.math.RayEpsilon * (1 + dr.max(dr.abs(self.origin.p)))
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Return whether the direction from the observer to ``hit`` follows the hit point when the scene moves.
 
-        Directions from a point in a medium follow only points of surfaces that scatter or emit light: see `scatter`.
+        A direction from a point in a medium follows the hit point only if that surface scatters or emits light: see
+        `scatter`.
         """
         active = active & ~self.keeps_direction & ~scatter.is_seen_through(self.trace, hit)
         if self.trace.media is None:
@@ -199,15 +205,16 @@ class ObserverVertex:
         return meet(self.trace, ray, active)
 
     def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-        """Return a ray's first hit on a surface that is not a null boundary; ``hit`` is the first on any surface."""
+        """Return a ray's first hit that is not on a null boundary; ``hit`` is the ray's first hit on any surface."""
         return hit if self.trace.media is None else skip_null(self.trace, ray, hit, active)
 
     def edge_surfaces(
         self, rays: list[mi.Ray3f], firsts: list[mi.PreliminaryIntersection3f], active: mi.Bool
     ) -> tuple[list[mi.PreliminaryIntersection3f], mi.Bool]:
-        """Return the hits that form the edge between two rays, and the mask of lanes with a common null boundary.
+        """Return the hits that form the edge between two rays, and a mask.
 
-        The hits are the first hits of the rays or, with a common null boundary, the hits behind this boundary.
+        The mask contains the lanes in which both rays first hit the same null boundary. In these lanes, the result has
+        the hits behind the boundary. In all other lanes, it has the first hits ``firsts``.
         """
         if self.trace.media is None:
             return firsts, mi.Bool(False)
@@ -222,7 +229,7 @@ class ObserverVertex:
     def medium(self, d: mi.Vector3f) -> mi.MediumPtr:
         """Return the medium in direction ``d``; None in scenes without media."""
         if self.trace.media is None:
-            return None  # like `Arrival.medium`
+            return None  # `Arrival.medium` is also None in such scenes
         turns = self.vertex.surface & self.si.is_medium_transition()
         return dr.select(turns, self.si.target_medium(d), self.at.medium)
 
@@ -239,7 +246,7 @@ class ObserverVertex:
     def transmittance_past_edge(
         self, light: mi.DirectionSample3f, t: mi.Float, key: mi.UInt32, active: mi.Bool
     ) -> mi.Spectrum:
-        """Estimate the transmittance to an emitter sample past an edge at distance ``t``.
+        """Estimate the transmittance to an emitter sample. The shadow ray passes an edge at distance ``t``.
 
         The result is zero if the medium does not use emitter sampling.
         """
@@ -255,9 +262,10 @@ class ObserverVertex:
     def onward(
         self, arrivals: list[Arrival], t: mi.Float, key: mi.UInt32, active: mi.Bool
     ) -> tuple[mi.Spectrum, list[Arrival]]:
-        """Return the transmittance of the rays up to ``t``, and the arrivals of rays that start at ``t``.
+        """Return the transmittance up to distance ``t``, and the arrivals of rays that continue from there.
 
-        In lanes that are not ``active``, the transmittance is 1, and the arrivals are unchanged.
+        Each returned ray starts at distance ``t`` on the ray of one of the ``arrivals``. In lanes that are not
+        ``active``, the transmittance is 1, and the arrivals are unchanged.
         """
         if self.trace.media is None:
             return mi.Spectrum(1), arrivals

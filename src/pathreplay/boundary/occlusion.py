@@ -73,12 +73,12 @@ class ArcSegment(Arc):
             place, moves = mixed(place, dr.select(shade.dark, mi.UInt32(1), 0)), moves | may_move(trace, shade.hit)
         bright = dr.select(seen.is_valid(), DIM, mi.Float(trace.scene.environment() is not None))
         probe = VisibilityProbe(mixed(place, turned), at.p, at.n, moves, near, bright)
-        # The signature is 1, because 0 denotes the sky.
+        # A hit from which no light may come has the signature 1, because 0 denotes the sky.
         dark = replace(VisibilityProbe.of(1), moves=moves, near=near, bright=bright)
         return dr.select(counts, probe, dark)
 
     def _counts(self, seen: mi.PreliminaryIntersection3f) -> mi.Bool:
-        """Return whether light may come from a hit. If the hit is the last vertex of a path, it must be an emitter."""
+        """Return whether light may come from a hit. Where a path has to end, the hit must be on an emitter."""
         trace = self.observer.trace
         if trace.media is not None:
             return mi.Bool(True)
@@ -125,7 +125,10 @@ class ArcSegment(Arc):
     def _weights(
         self, bracket: Bracket, edge: OcclusionEdge, near: Side, far: Side, through: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """Return π/2 f / (l p(c)) for the integrand f on the near and the far side, with the same random numbers."""
+        """Return the Crofton weights π/2 f / (l p(c)) of both sides (see `crofton`).
+
+        f is the integrand on the near or on the far side. It is estimated with the same random numbers on both sides.
+        """
         observer, trace, x, active = self.observer, self.observer.trace, self.observer.selected, edge.active
         f, pdf = observer.towards(far.ray.d, active)
         per_length = 0.5 * dr.pi * bracket.weight * self.weight(pdf, active)
@@ -153,7 +156,10 @@ class Side:
 
 @dataclass
 class OcclusionEdge:
-    """An edge between two directions from a vertex. Its normal ``n`` points from the near to the far direction."""
+    """An edge between two directions from a vertex, towards its near and its far side.
+
+    The normal ``n`` of the edge points from the near side to the far side.
+    """
 
     observer: ObserverVertex
     near: Side
@@ -165,7 +171,7 @@ class OcclusionEdge:
 
     @staticmethod
     def of(observer: ObserverVertex, near: Side, far: Side, crease: Crease, active: mi.Bool) -> OcclusionEdge:
-        """Classify the edge between two sides, and compute its normal. Detached."""
+        """Classify the edge between two sides, and compute its normal. The result is detached."""
         own, d = observer.separates(near.ray.d, far.ray.d), near.ray.d
         shadow = mi.Bool(False) if crease.shadow is None else crease.shadow.exists
         edge = OcclusionEdge(observer, near, crease, active & ~shadow & own, observer.si.n, mi.Float(1), active)
@@ -188,9 +194,9 @@ class OcclusionEdge:
 
 @dataclass
 class HeldEdge:
-    """The motion V_edge of the direction to an edge. This direction follows a point of the near surface.
+    """The `Crossing` for the motion V_edge of the edge in the boundary term of `secondary`.
 
-    The class implements `Crossing`.
+    The direction to the edge follows a point of the near surface.
     """
 
     weight: mi.Spectrum
@@ -205,7 +211,10 @@ class HeldEdge:
 
 @dataclass
 class MovedSide:
-    """The motion V of sampled directions on one side of an edge. V is the same as in the interior term."""
+    """The `Crossing` for the motion V_near or V_far of sampled directions on one side of an edge: see `secondary`.
+
+    The interior term moves the sampled directions in the same way.
+    """
 
     weight: mi.Spectrum
     edge: OcclusionEdge

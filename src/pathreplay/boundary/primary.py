@@ -10,17 +10,17 @@ over the film changes by the jump times the area that the edge sweeps. Short seg
 where B(s, π) = 0 on the edge, f_a and f_b are the radiances on its two sides, and w is the direction from a to b. The
 function B depends on the kind of edge:
 
-- outline: B = n·(o + t d - z), where the ray (o, d) of the path hits the nearer surface at distance t, z is the point
-  that was hit, with fixed surface coordinates, and n is perpendicular to edge and ray
-- contact of two surfaces: the difference of their distances
-- smooth-shaded mesh: the dot product of ray direction and shading normal; it vanishes slightly before the outline, and
-  the mesh is black from there on
-- boundary of a hard shadow: B = n·(x + r d - z), where the visible point x slides with the path, and z is the point of
-  the occluder at distance r from x in the direction d of the light
+- Outline: B = n·(o + t d - z). The ray (o, d) of the path hits the nearer surface at distance t, in the point z. The
+  surface coordinates of z are fixed. The vector n is perpendicular to the edge and to the ray.
+- Contact of two surfaces: B is the difference of the distances of the two surfaces along the ray.
+- Smooth-shaded mesh: B is the dot product of the ray direction and the shading normal. B vanishes slightly before the
+  outline of the mesh. Between this line and the outline, the mesh is black.
+- Boundary of a hard shadow: B = n·(x + r d - z). The visible point x slides with the path. The light lies in the
+  direction d from x, and z is the point of the occluder in this direction, at distance r from x.
 
-In a medium, both sides of an edge at distance t₀ share the transmittance T and all light scattered before t₀. The
-radiance jump is T(t₀) (L of the near surface - L of the ray that continues in the same medium). Beyond t₀ paths are
-sampled as usual.
+In a medium, both sides of an edge at distance t₀ share the transmittance T and all light that is scattered before t₀.
+The radiance jumps by T(t₀) (L_near - L_far). Here L_near is the radiance of the near surface, and L_far is the radiance
+along the ray that continues in the same medium. Beyond t₀, paths are sampled as usual.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         return chain_config(self.trace)
 
     def guided(self, n: int, seed: mi.UInt32) -> PrimarySearch:
-        """Refine the density with a pilot pass, whose segments are twice as long: see `EdgeSearch`."""
+        """Refine the density with a pilot pass (see `EdgeSearch`). Pilot segments have twice the usual length."""
         wide, n_pilot = replace(self, length=2 * self.length), pilot_size(n, self.film.size)
         pilot = wide.draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.PILOT.of(seed))
         return replace(self, density=self.density.refined(pilot.c, wide.detect(pilot) * pilot.density))
@@ -117,8 +117,8 @@ class PrimarySearch(FilmSearch[FilmSegment]):
     def _jump(self, split: ChainSplit, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """Estimate f_a - f_b with the same random numbers on both sides. ``ray`` is the camera ray of side a."""
         trace = self.trace
-        # On coarse meshes, the plane of a triangle cuts off part of the lobes. If `steady` makes the shading frames
-        # continuous across triangles, this cut-off is the only difference between the two sides of a crease.
+        # On coarse meshes, a triangle occludes the part of a lobe that lies below its plane. `steady` makes the shading
+        # frames continuous across triangles, so that only this occlusion differs between the two sides of a crease.
         onward = replace(trace, steady_frames=trace.traits.coarse_meshes and not trace.traits.brushed_meshes)
         sides, T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:

@@ -1,8 +1,8 @@
 """Edge search, shared by all boundary terms: draw segments, detect edges, resample, bisect, weigh and record.
 
 Most segments cross no edge. A first kernel therefore probes all segments. Segments are then resampled by importance,
-and a second kernel bisects a fixed number of segments. No lane of the second kernel is wasted, and its width is the
-same in every pass. A pilot pass with few segments determines the density of all other segments on the film.
+and a second kernel bisects a fixed number of segments. The second kernel has the same number of lanes in every pass,
+and wastes none of them. A pilot pass with few segments determines the density of all other segments on the film.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ class EdgeSearch(ABC, Generic[Segments]):
     bisection: ClassVar[Stream]  # random stream for the choice among the crossings of one segment
 
     def find(self, n: int, resolved: int, seed: mi.UInt32) -> Edges:
-        """Probe ``n`` segments, resample ``resolved`` of them by importance, and return their edges. Detached."""
+        """Probe ``n`` segments, resample ``resolved`` of them by importance, and return their edges, detached."""
         search = self.guided(n, seed)
         importance = search.detect(search.draw(dr.arange(mi.UInt32, n), n, seed))
         chosen = Resampled.of(importance, resolved, seed)
-        weight = chosen.weight * dr.opaque(mi.Float, 1 / n)  # opaque, so that all values of n share one kernel
+        weight = chosen.weight * dr.opaque(mi.Float, 1 / n)  # opaque: the kernel does not depend on n
         generator = mi.PCG32(resolved, initstate=seed + int(self.bisection), initseq=dr.arange(mi.UInt32, resolved))
         return search.resolve(search.draw(chosen.index, n, seed), weight, generator)
 
     def guided(self, n: int, seed: mi.UInt32) -> EdgeSearch[Segments]:
-        """Return a search with a density that a pilot pass has refined, or this search if there is no pilot pass."""
+        """Run a pilot pass, and return a search with a refined density. Without a pilot pass, return this search."""
         return self
 
     @abstractmethod
@@ -68,7 +68,8 @@ class EdgeSearch(ABC, Generic[Segments]):
     def resolve(self, segments: Segments, weight: mi.Float, generator: mi.PCG32) -> Edges:
         """Locate edges on the segments by bisection, compute their weights, and record the paths to the edges.
 
-        ``weight`` is the weight of each lane in the mean over all segments; lanes of weight zero have no edge.
+        ``weight`` has one weight per lane. The sum of weight times contribution estimates the mean over all segments.
+        Lanes of weight zero have no edge.
         """
 
 
@@ -127,7 +128,7 @@ class Resampled:
     """Index of the segment that each lane resolves, and the weight of the lane."""
 
     index: mi.UInt32
-    weight: mi.Float  # 1 / expected number of lanes with that segment; 0: no segment has an edge
+    weight: mi.Float  # 1 / expected number of lanes that resolve the same segment; 0 if no segment has an edge
 
     @staticmethod
     def of(mass: mi.Float, lanes: int, seed: mi.UInt32) -> Resampled:
@@ -139,7 +140,7 @@ class Resampled:
         lane = dr.arange(mi.UInt32, lanes)
         x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, lane, ROUNDS))) * (total / lanes)
         index = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, cdf, i) <= x)
-        index = mi.UInt32(dr.minimum(index, n - 1))  # a Python integer if there is one segment
+        index = mi.UInt32(dr.minimum(index, n - 1))  # binary_search returns a Python integer if n is 1
         importance = dr.gather(mi.Float, mass, index)
         return Resampled(index, dr.select(importance > 0, mi.Float(total / lanes) / importance, 0))
 
@@ -164,11 +165,12 @@ class SegmentDensity:
         return SegmentDensity(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
     def refined(self, s: mi.Point2f, importance: mi.Float, unrefined: float = UNREFINED) -> SegmentDensity:
-        """Increase the density at positions ``s`` of given ``importance``, and around them, where edges continue.
+        """Increase the density in the pixels that contain the positions ``s``, and in their neighbours.
 
-        Probabilities are proportional to the square root of the importance in each pixel. This choice minimises the
-        variance, a sum of (contribution of a segment)² / density. A fraction ``unrefined`` of the segments keeps the
-        previous density.
+        The ``importance`` of a position is added to its pixel. Smaller amounts are added to the neighbours, because
+        edges continue there. The probability of a pixel is proportional to the square root of the importance in the
+        pixel. This choice minimises the variance, a sum of (contribution of a segment)² / density. A fraction
+        ``unrefined`` of the segments keeps the previous density.
         """
         n, c = self.width * self.height, s + self.margin
         counts = dr.zeros(mi.Float, n)
@@ -197,7 +199,7 @@ class SegmentDensity:
         if self.cdf is None:
             return u * mi.Point2f(self.width, self.height) - self.margin, mi.Float(1 / n)
         below = lambda i: dr.gather(mi.Float, self.cdf, i) <= u.x  # noqa: E731
-        i = mi.UInt32(dr.minimum(dr.binary_search(0, n - 1, below), n - 1))  # an integer if there is one pixel
+        i = mi.UInt32(dr.minimum(dr.binary_search(0, n - 1, below), n - 1))  # converts a Python integer, if n is 1
         probability = self._probability(i)
         begin = dr.gather(mi.Float, self.cdf, i) - probability
         x = dr.clip((u.x - begin) / probability, 0, dr.one_minus_epsilon(mi.Float))

@@ -41,7 +41,10 @@ refractions lie at other film positions."""
 
 @dataclass
 class CameraPath:
-    """A camera path to a vertex, from which edges are searched on a segment in an emitter's square and on an arc."""
+    """A camera path to a vertex. Two segments of the vertex are searched for edges.
+
+    One segment lies in the unit square of an emitter, and the other is an arc of directions.
+    """
 
     s: mi.Point2f  # film position
     density: mi.Float  # density of ``s``, per pixel
@@ -53,8 +56,8 @@ class CameraPath:
 class SecondarySearch(EdgeSearch[CameraPath]):
     """Edge search from path vertices. ``lengths`` are the lengths of segments in the unit square and of arcs (radians).
 
-    The search does not use the adjoint of the image, because forward mode has no adjoint and would select other
-    segments.
+    The search does not use the adjoint of the image. Forward mode has no adjoint, but must select the same segments as
+    reverse mode.
     """
 
     lengths: tuple[float, float]
@@ -68,7 +71,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         return SecondarySearch(trace, film, SegmentDensity(int(film.size.x), int(film.size.y), 0.0), lengths)
 
     def guided(self, n: int, seed: mi.UInt32) -> SecondarySearch:
-        """Refine the density with a pilot pass, which has more segments at cast shadows: see `EdgeSearch`."""
+        """Refine the density with a pilot pass (see `EdgeSearch`). Some pilot segments are drawn at cast shadows."""
         density = self.density
         if shapes := casters(self.trace):
             s, falls = cast_shadows(self.trace, shapes, self.film, Stream.CAST_SHADOWS.of(seed))
@@ -89,7 +92,11 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         )
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
-        """Draw the path of segment ``i``: see `EdgeSearch`. Indices from ``n`` to 2 n - 1 denote arcs."""
+        """Draw the path of segment ``i``: see `EdgeSearch`.
+
+        Indices below ``n`` denote segments in emitter squares, and indices from ``n`` to 2 n - 1 denote arcs. Segment i
+        and arc n + i have the same path.
+        """
         on_arc = i >= n
         i = dr.select(on_arc, i - n, i)
         s, density = self.density.draw(mi.Point2f(quasi_random(i, n, seed)))

@@ -6,9 +6,9 @@ boundary of the shadow is an edge on the film. Short segments with constant τ f
     dI/dπ = - Σ K dB/dπ,    K = π/2 · f / (l p(c) p(τ) N) · sgn(w·∂B/∂s) / |∂B/∂s|,    B = n·(x + r d - z),
 
 where f is the radiance that the lit side scatters to the camera, including the transmittances from the light to x and
-from x to the camera, and N is the number of segments. `primary` defines the symbols of B, for hard shadows on surfaces.
-In dB/dπ, x moves as in the interior term. ∂B/∂s is taken at constant τ, because the domain of the integral consists of
-film positions and distances.
+from x to the camera, and N is the number of segments. `primary` defines the symbols in B. In dB/dπ, x moves as in the
+interior term. ∂B/∂s is taken at constant τ, because the domain of the integral consists of film positions and
+distances.
 """
 
 from __future__ import annotations
@@ -61,7 +61,10 @@ class BeamCrossing:
 
 @dataclass(frozen=True)
 class VolumetricSearch(FilmSearch[BeamSegment]):
-    """Edge search over film positions and distances, without a pilot pass: shadow boundaries fill much of the image."""
+    """Edge search over film positions and distances.
+
+    There is no pilot pass, because shadow boundaries in a medium fill much of the image.
+    """
 
     bisection = Stream.BISECT_VOLUMETRIC
 

@@ -1,8 +1,8 @@
 """Connects a job to Ray: to a private cluster on this machine, or to the cluster at an address.
 
-A private cluster listens on loopback only, whereas Ray by default listens on every interface. It requires a secret
-token from every client, and keeps its sockets in a folder that only this user can enter. A cluster at an address must
-have authentication enabled, because Ray unpickles requests and answers.
+By default, Ray listens on every network interface. A private cluster listens on loopback only, requires a secret token
+from every client, and keeps its sockets in a folder that only this user can enter. The cluster at an address must have
+authentication enabled, because Ray unpickles requests and answers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pathreplay.platform.interrupts import undisturbed
 OLDEST = (2, 60)
 """First version of Ray whose token authentication covers clusters that a program starts."""
 
-# If this variable is 0, Ray uses only loopback addresses. Ray provides it for systems whose firewalls block clusters.
+# If this variable is 0, Ray uses only loopback addresses. The variable exists for systems whose firewalls block Ray.
 _MANY_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _MODE, _TOKEN, _ADDRESS = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"
 _LONGEST_FOLDER = 20
@@ -102,7 +102,7 @@ def _runs(process: psutil.Process) -> bool:
 def load_ray() -> ModuleType:
     """Import Ray. Raises PathreplayError if it is not installed or too old."""
     os.environ.setdefault(_MODE, "token")  # Ray reads this variable on import
-    # Keep Ray from hiding devices from actors that reserve no GPU. Ray warns if the variable is not set.
+    # With the value 0, actors that reserve no GPU still see all GPUs. Ray warns if the variable is not set.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         import ray
@@ -154,7 +154,8 @@ def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
 def _start(ray: ModuleType, stack: contextlib.ExitStack, cores: int) -> Cluster:
     """Start a private cluster, which ends when ``stack`` closes. Raises PathreplayError if Ray cannot start safely."""
     temporary = tempfile.gettempdir()
-    # Other users cannot enter a folder of mkdtemp, unlike Ray's default folder. Socket paths have up to 107 characters.
+    # Other users can enter Ray's default folder, but not a folder made by mkdtemp.
+    # A socket path has at most 107 characters.
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=temporary if len(temporary) <= _LONGEST_FOLDER else "/tmp")
     guard = Guard(Path(folder))
     stack.callback(guard.close)
@@ -250,9 +251,9 @@ def _require_closed(ray: ModuleType, address: str) -> None:
 def _private_environment(ray: ModuleType) -> Iterator[None]:
     """Make Ray start clusters within this block on loopback, with our token, and without usage statistics."""
     settings = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
-    # Seconds without a response of the head node after which Ray ends this process. `Cluster.require` raises earlier.
+    # Ray ends this process if the head node does not respond for this many seconds. `Cluster.require` raises before.
     settings["RAY_gcs_rpc_server_reconnect_timeout_s"] = str(10**6)
-    settings["RAY_worker_niceness"] = "0"  # keep the priority of this process, because the actors do its work
+    settings["RAY_worker_niceness"] = "0"  # give the actors the CPU priority of this process
     before = {name: os.environ.get(name) for name in settings}
     constants = ray._private.ray_constants
     many = constants.ENABLE_RAY_CLUSTER

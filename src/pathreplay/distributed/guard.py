@@ -1,9 +1,8 @@
 """Removes all processes and files of a private Ray cluster, however the run's process ends.
 
 The guard is a separate process that outlives the run's process. When the run's process ends, the kernel ends the Ray
-processes that the run's process has started, but not the children of these Ray processes. Without the guard, the agents
-of a killed raylet would run forever. If the raylet is gone, Ray ends the run's process without a message. In this case
-the guard prints the reason.
+processes that the run has started, but not their child processes. Without the guard, the agents of a killed raylet
+would run forever. If the raylet is gone, Ray ends the run's process without a message, and the guard prints the reason.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ shutil.rmtree(sys.argv[1], ignore_errors=True)
 
 
 class Guard:
-    """Starts a guard, which ends the watched sessions and removes ``folder`` at `close` or when this process ends."""
+    """Starts a guard. At `close`, or when this process ends, the guard ends all its sessions and removes ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -109,11 +109,14 @@ class WorkerPool:
         return [number for number in self.ready if number not in busy]
 
     def ask(self, number: int, call: _Call, *request: object) -> None:
-        """Send a request to evaluate shards to an actor."""
+        """Send an actor a request to evaluate shards."""
         self.calls[self.actors[number].evaluate.options(max_task_retries=0).remote(*request)] = call
 
     def sent(self, arrays: Arrays) -> Arrays | Reference:
-        """Return arrays as a request argument: large arrays are put into the object store, and referenced."""
+        """Return the argument of a request that stands for arrays.
+
+        Small arrays are returned themselves. Large arrays are put into the object store, and a reference is returned.
+        """
         return arrays if _bytes_of(arrays) < SMALL else self.ray.put(arrays)
 
     def answered(self, patience: float) -> list[tuple[_Call, Reference]]:
@@ -173,7 +176,7 @@ class WorkerPool:
             )
 
     def _lost(self, call: _Call, error: Exception) -> None:
-        """Initialize a lost actor again, or remove it if Ray will not restart it again.
+        """Initialize a lost actor, which Ray restarts. If no restart is left, remove the actor.
 
         Raises PathreplayError if no actor is left.
         """
@@ -260,7 +263,7 @@ class RayExecutor:
             late = len(step.again)
             first = step.next(number, time.monotonic(), idle)
             if first is None:
-                break  # skip the other idle actors, which are unlikely to get a shard and may be many
+                break  # do not ask the remaining idle actors: they may be many, and are unlikely to get a shard
             self.pool.counts.twice += len(step.again) - late
             indices = (first, *step.along(number, size, len(self.pool.ready)))
             self.pool.ask(
@@ -320,10 +323,10 @@ def require_executor(config: Config) -> None:
 
 @contextmanager
 def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Tell) -> Iterator[WorkerPool | None]:
-    """Start the actors of a job, yield them, and end them after this block; None if the job runs in this process.
+    """Start the actors of a job, yield them, and end them after this block.
 
-    ``tell`` receives log lines, and ``status`` the progress within a step. Raises PathreplayError if the cluster cannot
-    be used or is too small.
+    Yields None if the job runs in this process. ``tell`` receives log lines, and ``status`` the progress within a step.
+    Raises PathreplayError if the cluster cannot be used or is too small.
     """
     if config.executor != "ray":
         yield None
@@ -345,7 +348,7 @@ def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Te
             yield pool
             tell(f"ray: {pool.counts.line()}")
         finally:
-            if cluster.is_shared():  # the end of a private cluster also ends its actors
+            if cluster.is_shared():  # the actors of a private cluster end with the cluster
                 for actor in pool.actors.values():
                     ray.kill(actor)
 

@@ -68,12 +68,12 @@ class Scheduler:
     times: dict[tuple[Actor, Kind], int] = field(default_factory=dict)
     """Number of evaluations per actor and kind."""
     waited: dict[Actor, float] = field(default_factory=dict)
-    """Per actor: sum of ``refused`` over earlier steps, since the actor last took a shard from another owner."""
+    """Per actor: sum of its values of ``refused`` in all steps since the actor last took a shard of another owner."""
     refused: dict[Actor, float] = field(default_factory=dict)
-    """Per actor that took no shard of the busiest owner in this step: the remaining seconds of the owner's work."""
+    """Per actor that declined to take a shard of the busiest owner in this step: the seconds of that owner's work."""
 
     def begin(self) -> None:
-        """Begin a step: add the seconds in ``refused``, which the previous step has collected, to ``waited``."""
+        """Begin a step: add the values of ``refused``, which the previous step has set, to ``waited``."""
         for actor, seconds in self.refused.items():
             self.waited[actor] = self.waited.get(actor, 0.0) + seconds
         self.refused.clear()
@@ -172,9 +172,9 @@ class Step:
         most = self._busiest(now)
         if most is not None:
             other, left = most
-            # Leave a shard to its owner if the owner finishes all its work before this actor would finish the shard.
-            # Work that this actor declined in earlier steps is added to the owner's work: otherwise, an actor that
-            # joins late would never compile any kernels.
+            # The owner keeps a shard if the owner would finish all its work before this actor finished the shard.
+            # However, the owner's work counts as longer if this actor has declined shards in earlier steps.
+            # Otherwise, an actor that joins late would never compile any kernels.
             worth = left + self.scheduler.waited.get(actor, 0.0)
             for place in reversed(range(len(self.waiting[other]))):
                 if (self.scheduler.expected(actor, self.kinds[self.waiting[other][place]]) or 0.0) < worth:
@@ -193,7 +193,8 @@ class Step:
 
         The time of a request is limited to a fraction of the actor's remaining work, and to the work of the whole step
         divided by the number of ``actors``. Requests therefore become shorter towards the end of a step, and all actors
-        finish at about the same time. `TOGETHER` limits the gradients of a request, which are ``size`` bytes per shard.
+        finish at about the same time. `TOGETHER` limits the size of the gradients of a request. Each shard has
+        gradients of ``size`` bytes.
         """
         waiting, request = self.waiting.get(actor, []), self.running[actor]
         if not self.scheduler.holds(actor, self.kinds[request.shards[0]]):
@@ -232,8 +233,8 @@ class Step:
     def lost(self, index: int, actor: Actor) -> None:
         """Mark a shard as waiting because its actor was lost, unless it is done or another actor is evaluating it.
 
-        The waiting shards of the lost actor are reassigned to the owners of their kinds. Usually, these kinds have no
-        owner any more, because `Scheduler.forget` has removed the lost actor as their owner.
+        The waiting shards of the lost actor are reassigned to the owners of their kinds. Usually, these kinds no longer
+        have an owner: the lost actor owned them, and `Scheduler.forget` has removed it.
         """
         self.heard(index, actor)
         self.left.pop(actor, None)

@@ -78,7 +78,7 @@ class RayActor:
         self.log: Log
 
     def hello(self, setup: WorkerInit) -> Ready:
-        """Build the problem; must be called first. Raises PathreplayError if this is impossible on this machine."""
+        """Build the problem; must be called first. Raises PathreplayError if the problem cannot be built here."""
         backend.set_variant(setup.variant)
         dr.set_thread_count(setup.threads)
         self.evaluators = {}
