@@ -49,7 +49,7 @@ class Boundary:
 
     film: bool = True  # edges visible from the camera
     inner: bool = True  # edges visible from surfaces and points in media
-    spp: int = 0  # segments per pixel, for each search; 0: as many as the samples of the pass
+    spp: int = 0  # segments per pixel of each search; 0 means the samples per pixel of the pass
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Compute the tangent of the image: see `Term`."""
@@ -84,14 +84,15 @@ class Boundary:
 
     @staticmethod
     def move(view: Pass, trace: TraceConfig) -> bool:
-        """Return whether edges depend on parameters with gradients. Computations are traced, but not evaluated."""
+        """Return whether edges depend on parameters with gradients. Dr.Jit traces the test, but evaluates nothing."""
         return _move(trace, FilmPlaces.of(view))
 
     @staticmethod
     def informed(view: Pass, trace: TraceConfig) -> TraceConfig:
-        """Add the moving shapes to ``trace``.
+        """Return ``trace`` with the moving shapes added.
 
-        With media, all shapes are treated as moving, because paths cross null boundaries that may move.
+        In a scene with media, ``trace`` is returned unchanged. All shapes then count as moving, because paths cross
+        null boundaries that may move.
         """
         if trace.media is not None or trace.traits.moving is not None:
             return trace
@@ -143,10 +144,10 @@ def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Return the sensors that count as static.
+    """Return the sensors that are treated as static.
 
-    The sensors that the pass does not use count as static. The sensor of the pass counts as static only if the pass has
-    a film flow, because `FilmDomain.flows` then marks the rays that move.
+    All sensors except the sensor of the pass are treated as static. If the pass has a film flow, the sensor of the pass
+    is treated as static, too: `FilmDomain.flows` then marks the camera rays that move.
     """
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 

@@ -83,7 +83,7 @@ class Pass:
     sensor: mi.Sensor
     seed: Seed
     spp: int = 0
-    share: float = 1.0  # weight of this pass in a mean of images, if it is a part of a longer pass: see `parts`
+    share: float = 1.0  # weight of this pass in a mean of images, if the pass is a part of another: see `parts`
     uses_sobol: bool = False
     # If set, film positions s move with the velocity v of the flow. The derivative of a camera ray c(s, π) with respect
     # to the parameters π is then ∂c/∂π + ∂c/∂s v, in place of ∂c/∂π: see `camera_flow`.
@@ -138,7 +138,8 @@ class Pass:
         """
         bits = (paths - 1).bit_length()
         morton = morton_index(pixel % width, pixel // width)
-        # The index has 32 bits. Excess leading bits select the set of samples, together with the seed and ``of``.
+        # A Sobol index has 32 bits. The bits of ``morton`` that do not fit select the set of samples, with the seed and
+        # ``of``.
         overflow = morton >> (32 - bits) if bits else mi.UInt32(0)
         return OwenSobolSampler.of((morton << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), overflow))
 

@@ -66,7 +66,7 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
 
 
 def particle_notes(trace: TraceConfig, sensor: mi.Sensor) -> Iterator[str]:
-    """Yield messages about derivatives of light paths that are missing from the gradient."""
+    """Yield messages about the derivatives that the gradient of light paths leaves out."""
     if sensor.film().rfilter().is_box_filter():
         yield (
             f"the film of sensor '{sensor.id()}' has a box filter, whose derivative is zero: the motion of light paths "

@@ -10,7 +10,8 @@ import mitsuba as mi
 from pathreplay.platform import compat
 from pathreplay.scenes.parameters import needs_ray_adjoint
 
-# Parameters that move points of a surface. All other parameters that do so have Mitsuba's flag `Discontinuous`.
+# Parameters that move points of a surface. Other parameters that move such points have Mitsuba's flag
+# `Discontinuous`.
 _POSITIONS = {*compat.POSITIONS, "to_world", "control_points"}
 
 

@@ -81,16 +81,16 @@ class PathReplayIntegrator(PathIntegrator):
 
     Properties: see `PATH_REPLAY` in `integrators/properties.py`.
 
-    ``boundary = 'auto'`` means ``all`` if something that can occlude light moves (see `edges_move`) and the boundary
-    term can be computed. Otherwise ``auto`` means ``none``. The boundary term cannot be computed with an ``attach``
-    other than ``delta``, for sensors of type ``batch``, and in scenes with an ``sdfgrid``. For such a sensor or shape,
-    a warning is logged. Without motion, no boundary term is computed for any value of ``boundary``.
+    ``boundary = 'auto'`` means ``all`` if edges move (see `edges_move`) and the boundary term can be computed.
+    Otherwise, ``auto`` means ``none``. The boundary term cannot be computed if ``attach`` is not ``delta``, if the
+    sensor is of type ``batch``, or if the scene contains an ``sdfgrid``. With ``auto``, a warning reports such a sensor
+    or shape. If no edge moves, no boundary term is computed for any value of ``boundary``.
 
-    Gradients of media use a control variate that this integrator learns from earlier gradient passes with other seeds.
-    ``null_branching`` traces one more path from a null collision, as if the path had been scattered there. Without null
-    branching, the gradient with respect to extinction is wrong where extinction is zero. With
-    ``null_branching = 'auto'``, paths branch if extinction with gradients varies in space or is zero. In these cases,
-    branching usually also takes less time at equal noise.
+    Gradients of media use a control variate. The integrator learns the control variate from earlier gradient passes
+    with other seeds. With ``null_branching``, an additional path continues from a null collision, as if the path had
+    been scattered there. Without null branching, the gradient with respect to extinction is wrong where extinction is
+    zero. With ``null_branching = 'auto'``, paths branch if the extinction has gradients, and varies in space or is
+    zero. In these cases, null branching usually also reaches a given noise level in less time.
 
     The integrator does not differentiate visibility that ``boundary`` leaves out. With ``attach='none'``, it does not
     differentiate the motion of shapes, cameras and directions. Without ``null_branching``, it does not differentiate
@@ -124,7 +124,7 @@ class PathReplayIntegrator(PathIntegrator):
             )
         split = self.name == "pathreplay" and choice(props, self.name, declared.CAUSTICS) == "particles"
         self.particles: ParticleTerm | None = ParticleTerm(self.max_depth, caustics=True) if split else None
-        self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # the scene, and its learned state
+        self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # a scene; state learned from it
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -140,7 +140,7 @@ class PathReplayIntegrator(PathIntegrator):
         return image if lit is None else image + lit
 
     def _camera_view(self, view: Pass) -> Pass:
-        """Return the pass whose rays start camera paths. Here, it is ``view`` itself."""
+        """Return the pass that generates the camera rays. In this class, it is the pass ``view`` itself."""
         return view
 
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
@@ -204,9 +204,9 @@ class PathReplayIntegrator(PathIntegrator):
         return self.boundary != "primary" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
 
     def _needs_edges(self, view: Pass, trace: TraceConfig) -> bool:
-        """Return whether boundary terms are needed and, with ``boundary = 'auto'``, whether they can be computed.
+        """Return whether edges move. With ``boundary = 'auto'``, return False if boundary terms cannot be computed.
 
-        With ``auto``, log that the terms are costly, or why they are left out.
+        With ``auto``, log either that the boundary terms are costly, or why they are left out.
         """
         if not Boundary.move(view, trace):
             return False
@@ -257,9 +257,9 @@ class PathReplayIntegrator(PathIntegrator):
     ) -> mi.TensorXf:
         """Render an image and back-propagate a loss with derivative offset + slope · image, in one pass.
 
-        The paths of a pixel form independent sets (see `pixel_sweep`). The interior term evaluates the loss derivative
-        of a path from the paths of all other sets. The boundary term evaluates the loss derivative from the image. The
-        documentation of `sweep` states what is not differentiated.
+        The paths of a pixel form independent sets (see `pixel_sweep`). In the interior term, the loss derivative for a
+        path is evaluated at the mean radiance of all paths in other sets. In the boundary term, the loss derivative is
+        evaluated at the image. The documentation of `sweep` states what is not differentiated.
 
         Warns like `render_backward`. Requires `supports_pixel_sweep`.
 

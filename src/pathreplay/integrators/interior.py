@@ -104,7 +104,7 @@ class PathReplay:
         return TermResult(image, lost=lost.count, paths=lanes * view.spp, moves=True) if moves else TermResult(image)
 
     def _or_emission_only(self, driver: Driver) -> Driver:
-        """Return the driver. With ``auto``, it runs `emission_only` if only emitters have gradients."""
+        """Return a driver. With ``auto``, the result runs `emission_only` if only emitters have gradients."""
         return lights_or(driver) if self.auto else driver
 
     def note(self, trace: TraceConfig) -> str:

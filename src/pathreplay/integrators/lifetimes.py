@@ -42,11 +42,11 @@ class _Entry(Generic[T]):
 
     scene: mi.Scene
     about: T
-    held_once: object = field(default_factory=object)  # only this entry references this object: see `is_unreferenced`
+    held_once: object = field(default_factory=object)  # object without other references: see `is_unreferenced`
 
     @property
     def is_unreferenced(self) -> bool:
-        """Whether only this entry references the scene. Python's count includes Mitsuba's references to the scene."""
+        """Whether only this entry references the scene. Python's reference count includes Mitsuba's references."""
         return sys.getrefcount(self.scene) <= sys.getrefcount(self.held_once)
 
 
@@ -145,7 +145,7 @@ def _acquire() -> bool:
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Context that unwraps a PathreplayError which Dr.Jit, at the end of a loop, has wrapped in other exceptions."""
+    """Context that raises a PathreplayError itself instead of the exception in which Dr.Jit wraps it after a loop."""
     try:
         yield
     except RuntimeError as error:
@@ -166,7 +166,7 @@ def _hide_garbage() -> None:
 
 
 def _on_collection(phase: str, info: dict[str, int]) -> None:
-    """Handle a garbage collection: before it, make hidden objects visible again; after it, release scenes."""
+    """Handle a garbage collection: make hidden objects visible before it, and release scenes after it."""
     global _hidden
     if is_recording() or not _AT_COLLECTION.acquire(blocking=False):
         return

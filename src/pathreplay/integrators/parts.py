@@ -26,8 +26,9 @@ from pathreplay.scenes.parameters import SceneValue, is_transform
 # of a scalar's gradient is then below 1e-2. If the contributions differ, this error is far below the noise of the
 # gradient.
 MOST_AT_ONCE = 2**24
-# Samples of a part of a split pass. The relative rounding error of a scalar's gradient is 1.3e-3. A part takes a few
-# tenths of a second; the time to trace its kernel again is negligible in comparison.
+# Number of samples of a part, if a pass is split. At this number, the relative rounding error of a scalar's gradient is
+# 1.3e-3. A part takes a few tenths of a second. The time to trace the kernel again for the part is negligible in
+# comparison.
 A_PART = 2**22
 # Largest number of samples per pixel in one pass or part. At this number, a pixel of constant colour has a relative
 # rounding error of 7e-4.
@@ -112,10 +113,11 @@ def _arrays(value: SceneValue) -> list[dr.ArrayBase]:
 
 
 def split(sampler: mi.Sampler, spp: int, most: int) -> list[int]:
-    """Return the samples per pixel of each part, at most ``most``.
+    """Return the number of samples per pixel of each part. No part has more than ``most``.
 
-    For an `independent` sampler, the counts add up to ``spp``. Other samplers stratify the samples of a pixel. Their
-    counts are powers of four, which every sampler accepts, and may add up to more than ``spp``.
+    For an `independent` sampler, the numbers add up to ``spp``. Other samplers stratify the samples of a pixel. If the
+    pass is split, their numbers are powers of four, which every sampler accepts. The sum of these numbers may exceed
+    ``spp``.
     """
     if spp <= most:
         return [spp]

@@ -40,8 +40,8 @@ class PassState:
         return replace(self, result=self.result + replace(result, image=None))
 
     def to_record(self) -> PassState:
-        """Return the state as an input of a function that `dr.freeze` records, without ``passes``.
+        """Return the state without ``passes``, as an input of a function that `dr.freeze` records.
 
-        A recorded pass does not know its own key, and cannot check whether ``passes`` contains it.
+        A recorded pass cannot read its own key. It therefore cannot check whether ``passes`` contains this key.
         """
         return replace(self, passes=frozenset())

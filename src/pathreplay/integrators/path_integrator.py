@@ -121,9 +121,9 @@ class PathIntegrator:
     ) -> mi.TensorXf:
         """Compute the tangent of the image from the tangents of the parameters: see Mitsuba's ADIntegrator.
 
-        The parameters must carry their tangents already. If they are computed from another variable ``x``, call
-        ``dr.set_grad`` on ``x`` and propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)`` first. Warns like
-        `render_backward`.
+        The parameters must carry their tangents already. If the parameters are computed from another variable ``x``,
+        first call ``dr.set_grad`` on ``x``, and then propagate the tangents with
+        ``dr.forward(x, dr.ADFlag.ClearEdges)``. Logs the same warnings as `render_backward`.
         """
         tangent, state = self.tangent_pass(self.pass_of(scene, sensor, seed, spp), self.begin(scene))
         self.keep(scene, state)
@@ -180,7 +180,8 @@ class PathIntegrator:
                     part, trace, terms = self._planned(part, state)
                     learned = self._learned(part, trace, state)
                     weighted = grad_in if part.share == 1 else grad_in * part.share
-                    # All terms share the film flow. Isolation postpones back-propagation through the flow to the end.
+                    # All terms share the film flow. Isolation postpones back-propagation through the flow until all
+                    # terms are done.
                     with dr.isolate_grad():
                         result = self._backward(terms, part, trace, weighted, learned)
                 self._log_notes(part, trace, result)
@@ -253,7 +254,7 @@ class PathIntegrator:
         return Pass.of(scene, sensor, seed, spp, self.uses_sobol)
 
     def _require_active(self, scene: mi.Scene) -> None:
-        """Raise PathreplayError if the scene or this integrator belongs to another variant than the active one."""
+        """Raise PathreplayError if the scene or this integrator belongs to a variant that is not active."""
         if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
             raise PathreplayError(
                 f"{self.name}: scene or integrator belongs to another variant than the active one, "
@@ -267,7 +268,7 @@ class PathIntegrator:
             yield
 
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
-        """Build the trace configuration; ``sensor`` may be inside a medium. ``state`` None means a new state."""
+        """Build the trace configuration; ``sensor`` may be inside a medium. If ``state`` is None, create a state."""
         facts, state = facts_of(scene), PathIntegrator.begin(self, scene) if state is None else state
         return TraceConfig(
             scene=scene,
@@ -283,7 +284,7 @@ class PathIntegrator:
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
         """Return whether a parameter with gradients reaches the paths of a sensor. With media, the result is True.
 
-        One step of the paths is traced, but not evaluated.
+        Dr.Jit traces the computation of one path step, but evaluates nothing.
         """
         view = Pass.of(scene, sensor, 0, 1)
         with self._pass_context():
@@ -316,11 +317,11 @@ class PathIntegrator:
         require_nothing_learned(learned)
 
     def options(self) -> Json:
-        """Return no properties: see `StatefulIntegrator`."""
+        """Return an empty dictionary: see `StatefulIntegrator`."""
         return {}
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Suppress these notes."""
+        """Suppress the given notes."""
         self.warned.update(notes)
 
     def _described(self, **more: object) -> str:

@@ -13,7 +13,7 @@ from pathreplay.integrators.path_integrator import UNBOUNDED
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of an integrator. ``max_depth`` -1 is unbounded."""
+    """Limits on the paths of an integrator. A ``max_depth`` of -1 means that the path length is unbounded."""
 
     max_depth: int
     rr_depth: int

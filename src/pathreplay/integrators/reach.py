@@ -36,7 +36,7 @@ def attached_keys(params: mi.SceneParameters) -> list[str]:
 def unreached_note(scene: mi.Scene, sensor: mi.Sensor) -> str:
     """Format the message that no parameter with gradients reaches the paths of a sensor.
 
-    Returns "" if all parameters with gradients belong to other cameras: their gradient in this image is zero.
+    Returns "" if all parameters with gradients belong to other cameras. The gradient of this image is then zero.
     """
     params = mi.traverse(scene)
     keys = attached_keys(params)

@@ -1,4 +1,4 @@
-"""Facts about a scene. Its objects are collected once. Every pass determines which of the objects have gradients."""
+"""Facts about a scene. The scene's objects are collected once. Each pass determines which objects have gradients."""
 
 from __future__ import annotations
 
@@ -26,7 +26,11 @@ from pathreplay.transport.volume.media import Media, scene_media, wants_branch
 
 
 class SceneFacts:
-    """Facts about one scene. References to the scene's objects prevent other objects from reusing their addresses."""
+    """Facts about one scene.
+
+    This object keeps references to the objects of the scene. New objects therefore cannot get the addresses of these
+    objects.
+    """
 
     def __init__(self, scene: mi.Scene) -> None:
         nodes = nodes_of(scene)

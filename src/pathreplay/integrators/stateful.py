@@ -35,7 +35,7 @@ class StatefulIntegrator(Protocol):
         """Notes that were logged or silenced."""
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Suppress these notes."""
+        """Suppress the given notes."""
 
     def is_recordable(self, has_media: bool) -> bool:
         """Return whether `dr.freeze` is expected to record passes of this integrator."""
@@ -62,14 +62,14 @@ class StatefulIntegrator(Protocol):
 
     @property
     def baseline(self) -> object:
-        """Learned state, or None. At each change, a new object replaces the state."""
+        """Learned state, or None. Each change of the learned state creates a new object."""
 
     def state_dict(self) -> dict[str, np.ndarray]: ...
 
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None: ...
 
     def options(self) -> Json:
-        """Return the properties of an equivalent `pathreplay` integrator, except those of `PathIntegrator`."""
+        """Return properties with which `pathreplay` matches this integrator, without properties of `PathIntegrator`."""
 
 
 @dataclass(frozen=True)

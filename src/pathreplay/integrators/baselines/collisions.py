@@ -1,6 +1,6 @@
-"""Derivatives of individual tentative collisions along a path, for the driver `listing`.
+"""Derivatives of individual tentative collisions along a path, used by `listing`.
 
-The collisions are reproduced from the same random numbers instead of being stored.
+The collisions are not stored. They are reproduced from the random numbers with which the path was sampled.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def differentiate_flight(at: Arrival, flight: Flight, past: Sampler, active: mi.
 def differentiate_shadow(
     trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, past: Sampler, active: mi.Bool, weight: mi.Spectrum
 ) -> None:
-    """Differentiate the tentative collisions of an unoccluded shadow ray. In homogeneous media, it has none."""
+    """Differentiate the tentative collisions of an unoccluded shadow ray. There are none in homogeneous media."""
     stretch = Stretch.begin(ray, medium, active)
     while dr.hint(stretch.active, exclude=[trace], label="pathreplay: listing, shadow"):
         hit, a, b, inside = stretch.part(trace)

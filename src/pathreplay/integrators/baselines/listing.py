@@ -2,9 +2,10 @@
 
 A second pass with the same random numbers differentiates each tentative collision: null collisions as dσ_n/σ_n and real
 collisions as dσ_s/σ_s (supplement of Vicini, Speierer, Jakob 2021, listings 1 and 2). Where σ_n is zero, no null
-collision is sampled. Where σ_s is zero, no real collision is sampled. The derivatives of these collisions are then
-missing. On a constant grid, σ_n is zero everywhere, and the whole derivative of the transmittance is missing.
-`pathreplay` does not have this limitation. This driver exists for comparison.
+collision is sampled, and the gradient lacks the derivative of null collisions. Where σ_s is zero, no real collision is
+sampled, and the gradient lacks the derivative of real collisions. On a constant grid, σ_n is zero everywhere, and the
+gradient lacks the whole derivative of the transmittance. The integrator `pathreplay` does not have these limitations.
+This method exists for comparison only.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ from pathreplay.transport.vertex import TraceConfig, VertexSamples, reciprocal
 def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
-    Uses a global majorant for each medium. Not differentiated: derivatives that the listings miss (see the module),
-    visibility, and emission of media. Raises PathreplayError if paths move with the parameters, and for scenes without
-    media.
+    Each medium has a single majorant. The gradient lacks the derivatives that the listings miss (see the module).
+    Visibility and the emission of media are not differentiated. Raises PathreplayError if the scene has no media, or if
+    vertices or directions of the paths depend on parameters with gradients.
     """
     if dr.hint(trace.media is None, mode="scalar"):
         raise PathreplayError("prb_volume_listing differentiates media, and the scene has none: use 'pathreplay'")
@@ -42,7 +43,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
     sampler, path = start.sampler, PathState.begin(trace, start)
     if dr.hint(path_moves(trace, start, path.at), mode="scalar"):
         raise PathreplayError("prb_volume_listing does not differentiate motion: use 'pathreplay'")
-    L = path_radiance(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i; the loop subtracts β_i e_i at each vertex
+    L = path_radiance(trace, sampler.clone(), dr.copy(path))[0]  # the loop subtracts the contribution of each vertex
     ctx = mi.BSDFContext()
 
     while dr.hint(path.active, exclude=[trace, ctx], label="pathreplay: listing"):
@@ -69,7 +70,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
             if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
                 backward(dr.sum(δL * Lo))
 
-        # Differentiate the collisions along the shadow ray, which transmit the radiance of the emitter sample.
+        # The weights of the tentative collisions along the shadow ray multiply the radiance of the emitter sample.
         ray, begins = v.origin.spawn_ray_to(light.p), shadow_start(v, light, path.at.medium)
         differentiate_shadow(trace, ray, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
         path = onward

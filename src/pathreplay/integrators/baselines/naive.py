@@ -1,4 +1,4 @@
-"""The naive driver: automatic differentiation of a wavefront of paths, for comparison.
+"""Plain automatic differentiation of a wavefront of paths, for comparison.
 
 Every vertex of every path is evaluated to memory, and stays there until the AD graph of the whole loop has been
 traversed. Memory therefore grows with the number of paths times their length, as in plain reverse-mode AD.
@@ -23,10 +23,11 @@ T = TypeVar("T")
 
 
 def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
-    """Back-propagate the adjoint radiance ``δL`` into the parameters and the ``start``; return whether paths move.
+    """Back-propagate the adjoint radiance ``δL`` into the parameters and the rays of ``start``.
 
-    Uses the same estimator as `sweep`: equal random numbers give equal gradients. Not differentiated: see `tape`.
-    Raises PathreplayError if the paths depend on no parameter with gradients.
+    Returns whether vertices or directions of the paths depend on parameters with gradients. This function uses the
+    estimator of `sweep`: with equal random numbers, both functions compute equal gradients. `tape` states what is not
+    differentiated. Raises PathreplayError if the paths depend on no parameter with gradients.
     """
     with dr.resume_grad(), dr.isolate_grad():
         L, _, moves = tape(trace, start)
@@ -35,9 +36,9 @@ def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost
 
 
 def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
-    """Compute the tangent of the radiance along camera rays, ``(δL, valid, moves)``: see `forward`.
+    """Compute the tangent of the radiance along camera rays: see `ForwardDriver` for the returned values.
 
-    The parameters must carry their tangents already. Not differentiated: see `tape`.
+    The parameters must carry their tangents already. `tape` states what is not differentiated.
     """
     with dr.resume_grad():
         L, valid, moves = tape(trace, start)
@@ -45,7 +46,7 @@ def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter)
 
 
 def _cut(state: T) -> T:
-    """Return the same values. During AD traversal, the derivatives of these values are evaluated to memory.
+    """Return ``state`` unchanged. During AD traversal, the derivatives of ``state`` are evaluated to memory here.
 
     Without this function, the reverse pass would be a single kernel, whose size grows with depth. At 64 vertices,
     compilation takes a minute.
@@ -70,10 +71,12 @@ def _cut(state: T) -> T:
 
 @dr.syntax
 def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
-    """Compute the radiance L = Σ β_i e_i along the rays of a ``start`` as an AD variable: ``(L, valid, moves)``.
+    """Compute the radiance along the camera rays of ``start`` as an AD variable.
 
-    Every step is sampled detached and then evaluated attached. Not differentiated: visibility, Russian roulette and,
-    with ``attach='none'``, all motion. Non-finite adjoints are not detected. Call it under `dr.resume_grad`.
+    Returns the radiance, Mitsuba's alpha per path, and whether vertices or directions of the paths depend on parameters
+    with gradients. Every path step is sampled detached and then evaluated attached. Visibility and Russian roulette are
+    not differentiated. With ``attach='none'``, no motion is differentiated. Non-finite adjoints are not detected. The
+    caller must enable gradients (`dr.resume_grad`).
     """
     sampler = start.sampler
     with dr.suspend_grad():
@@ -82,7 +85,7 @@ def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, 
         valid = mi.Bool(trace.background_is_opaque) & path.active
     moves = path_moves(trace, start, at)
     L = mi.Spectrum(0)  # accumulated radiance
-    β = mi.Spectrum(1)  # attached throughput; ``o``, ``d`` and ``pdf`` below are attached as well
+    β = mi.Spectrum(1)  # attached throughput; the variables ``o``, ``d`` and ``pdf`` below are attached as well
     first = start.ray if moves else at.ray
     o, d, pdf = mi.Point3f(first.o), mi.Vector3f(first.d), mi.Float(at.pdf)
 

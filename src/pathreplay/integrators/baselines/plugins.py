@@ -32,9 +32,10 @@ LINEAR = Property(
 
 @dataclass(frozen=True)
 class OtherInterior:
-    """The interior term of a baseline, computed by its drivers.
+    """The interior term of a baseline, computed by ``reverse_driver`` and ``forward_driver``.
 
-    Media are differentiated with the score-function estimator, without control variate. Empty voxels get no derivative.
+    Media are differentiated with the score-function estimator, without a control variate. Empty voxels get no
+    derivative.
     """
 
     reverse_driver: Driver
@@ -56,7 +57,8 @@ class OtherInterior:
 class NaiveIntegrator(PathIntegrator):
     """AD of a wavefront path tracer, for comparison only: memory grows with depth (see `tape`).
 
-    Properties: as in `PathIntegrator`, and ``attach`` (``delta``, ``none``) as in `pathreplay`.
+    The integrator has the properties of `PathIntegrator`, and the property ``attach`` of `pathreplay` with the values
+    ``delta`` and ``none``.
     """
 
     name, properties = "naive_ad", (*PATHS, ATTACH)
@@ -70,8 +72,9 @@ class NaiveIntegrator(PathIntegrator):
 class RadiativeIntegrator(PathIntegrator):
     """Radiative backpropagation, for comparison only: time grows with the square of the depth.
 
-    Properties: as in `PathIntegrator`, and ``linear``. False (the default) is unbiased; True selects a biased variant
-    in linear time, see `radiative`. Motion is not differentiated, and there is no forward mode.
+    The integrator has the properties of `PathIntegrator`, and ``linear``. If ``linear`` is False (the default), the
+    gradient is unbiased. If ``linear`` is True, a biased variant runs in linear time (see `radiative`). Motion is not
+    differentiated, and there is no forward mode.
     """
 
     name, properties = "radiative_backprop", (*PATHS, LINEAR)
@@ -83,10 +86,11 @@ class RadiativeIntegrator(PathIntegrator):
 
 
 class ListingIntegrator(PathIntegrator):
-    """Delta tracking as first published, for comparison only: it misses derivatives (see `listing`).
+    """Delta tracking as first published, for comparison only. The gradient lacks some derivatives (see `listing`).
 
-    Properties: as in `PathIntegrator`. Reverse mode raises PathreplayError without media or with motion. Forward mode
-    uses `forward`, without control variate and null branching.
+    The integrator has the properties of `PathIntegrator`. Reverse mode raises PathreplayError if the scene has no media
+    or if something moves with the parameters. Forward mode uses `forward`, without a control variate and without null
+    branching.
     """
 
     name = "prb_volume_listing"

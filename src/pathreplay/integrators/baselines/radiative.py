@@ -33,10 +33,12 @@ def radiative(
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
     ``linear`` selects a biased variant in linear time. As in the biased variants of Nimier-David et al. (2020), the
-    incident radiance is left out: wherever a path continues, L_{i+1} is replaced by one in all channels. Emission and
-    next-event estimation (e_i) are unchanged. The magnitude of the gradient is then wrong and, in dark media, its sign
-    may also be wrong. The counter ``lost`` is not used. Not differentiated: visibility and, as with ``attach='none'``,
-    all motion. Raises PathreplayError if the paths depend on no parameter with gradients.
+    incident radiance is not estimated: wherever a path continues, the number one takes the place of L_{i+1} in all
+    channels. Emission and next-event estimation (e_i) are unchanged. The magnitude of the gradient is then wrong. In
+    dark media, the sign of the gradient may also be wrong.
+
+    The counter ``lost`` is not used. Visibility is not differentiated. As with ``attach='none'``, no motion is
+    differentiated. Raises PathreplayError if the paths depend on no parameter with gradients.
     """
     sampler, path = start.sampler, PathState.begin(trace, start)
 

@@ -1,4 +1,4 @@
-"""Film flow: the motion of a camera expressed as motion of film positions, which needs no boundary term.
+"""Film flow: the motion of a camera, expressed as motion of film positions. The latter needs no boundary term.
 
 When a camera rotates, the same radiance arrives at other film positions. Let π be the parameters, s a film
 position, c(s, π) its camera ray, and T(s, π) the image of s under a chosen flow, with T(s, π₀) = s and the velocity
@@ -6,15 +6,17 @@ v = ∂T/∂π. An integral over the film D with weights W does not depend on th
 
     ∫ W(s) L(c(s, π)) ds = ∫ W(T) L(c(T, π)) |∂T/∂s| ds.
 
-Its derivative therefore has two parts. The first differentiates the weights, with n normal to the border of D (see
-`FilmMotion`):
+The derivative of the integral with respect to π therefore has two parts. The first part is the derivative of the
+weights, where n is the normal of the border of D (see `FilmMotion`):
 
     ∫_D div(W v) L ds - ∮_∂D W L v·n dl.
 
-The second part is the derivative of L along the ray c(T, π). This ray moves by ∂c/∂π + ∂c/∂s v, the *rest* of the
-motion. The sum of both parts is correct for any smooth v. `CameraFlow` chooses v such that each ray keeps passing
-through its point p = o + r d at a distance r: v = -(∂p/∂s)⁺ ∂p/∂π. Rotation and change of the field of view then leave
-no rest; translation leaves parallax. For a static camera, `SurfaceFlow` follows the visible surfaces.
+The second part is the derivative of L that the motion of the ray c(T, π) causes. The derivative of this ray is
+∂c/∂π + ∂c/∂s v, the *rest* of the motion. The sum of both parts is correct for any smooth v.
+
+`CameraFlow` chooses v such that each ray keeps passing through the point p = o + r d at a distance r:
+v = -(∂p/∂s)⁺ ∂p/∂π. The rest is then zero for a rotation and for a change of the field of view. For a translation, the
+rest is the parallax. For a static camera, `SurfaceFlow` chooses v such that film positions follow the visible surfaces.
 """
 
 from __future__ import annotations
@@ -71,7 +73,7 @@ class FilmFlow(Protocol):
 
     @property
     def samples(self) -> int:
-        """Number n of samples: `FilmMotion` traces one group of paths for every n samples of a pixel."""
+        """Number of samples per pixel that one group of paths in `FilmMotion` replaces."""
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """Return the sensor's ray and its weight.
@@ -101,7 +103,7 @@ class CameraFlow:
     """The flow of a moving sensor: see `FilmFlow`."""
 
     sensor: mi.Sensor
-    r: mi.Float  # distance along a ray to the point p through which the moving ray still passes
+    r: mi.Float  # distance r from the origin of a ray to the point p (see the module)
     leaves_rest: bool  # whether rays have motion that the flow does not contain
     is_all: bool
     samples: int = 2
@@ -183,7 +185,7 @@ def probe_position(i: mi.UInt32, n: int) -> mi.Point2f:
 
 
 def ray_derivatives(sensor: mi.Sensor, sample: Sample) -> RayDerivatives:
-    """Return the derivatives of a ray with respect to its film position, by central differences. They are detached."""
+    """Return detached derivatives of a ray with respect to its film position, by central differences."""
     o, d = [], []
     with dr.suspend_grad():
         for step in (mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP)):
@@ -194,10 +196,11 @@ def ray_derivatives(sensor: mi.Sensor, sample: Sample) -> RayDerivatives:
 
 
 def _is_carried(sensor: mi.Sensor) -> bool:
-    """Return whether gradients of the camera's pose cause motion of rays that the flow may not contain.
+    """Return whether gradients of the camera's pose may leave motion of rays that the film flow does not contain.
 
-    The flow contains all rotation of a pinhole camera, but no parallax. The result is therefore True for a pinhole
-    camera whose translation has gradients, and for any other camera whose pose has gradients.
+    The film flow contains the whole motion of rays if a pinhole camera rotates, but does not contain parallax. The
+    result is therefore True for a pinhole camera whose translation has gradients, and for any other camera whose pose
+    has gradients.
     """
     poses = with_gradients(sensor, "to_world")
     if sensor.class_name() != PINHOLE:

@@ -95,7 +95,7 @@ class FilmPlaces:
         return _splat_adjoint(lambda L: self.pixels(pixel, L, wavelengths), dr.width(pixel), block_grad)
 
     def pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
-        """Return the pixels of a block to which radiance ``L`` is added by row-major index, without a filter."""
+        """Add radiance ``L`` to the pixels of a block by row-major index, without a filter, and return the pixels."""
         film, filtered = self.view.sensor.film(), self._block()
         offset, size = mi.ScalarPoint2i(film.crop_offset()), mi.ScalarVector2u(film.crop_size())
         block = mi.ImageBlock(size, offset, filtered.channel_count())

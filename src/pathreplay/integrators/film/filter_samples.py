@@ -28,7 +28,10 @@ def _step_centres(radius: float) -> mi.Float:
 
 @dataclass(frozen=True)
 class FilterSamples:
-    """Sampler of signed offsets from a pixel centre along one axis, in pixels, with the density of a filter."""
+    """Sampler of signed offsets from a pixel centre along one axis, in pixels, with the density of a filter.
+
+    The tabulated function is constant in each of `STEPS` steps (see the module).
+    """
 
     radius: float
     cdf: mi.Float  # cumulative distribution at the end of each step

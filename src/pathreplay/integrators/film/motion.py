@@ -118,11 +118,11 @@ class FilmMotion:
         return dr.select(f.single, self.flow.divergence(f.sample), dr.select(f.axis == 0, v.x, v.y))
 
     def _smooth_factors(self, view: Pass, f: FlowPaths) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Return (pixel, factor) for each pixel to which a path contributes through the local mean W̄ of the adjoint.
+        """Return the pixels to which a path contributes through the local mean W̄ of the adjoint, with factors.
 
-        `backward` multiplies the radiance of a path by a weight: the adjoint W of the path's own pixel, plus the sum of
-        factor · W̄ over the returned pixels. The first entry subtracts W̄ of the path's own pixel from W. For a path that
-        belongs to no pair, all factors are zero.
+        `backward` multiplies the radiance of a path by a weight. This weight is the adjoint W of the path's own pixel,
+        plus the sum of factor · W̄ over the returned pairs (pixel, factor). The first pair is the path's own pixel with
+        the factor -1, so that W becomes W - W̄. For a path that belongs to no pair of paths, all factors are zero.
         """
         width, height = view.size
         derivative, along_x = f.derivative, f.axis == 0

@@ -21,7 +21,7 @@ from pathreplay.platform.device import device_of
 
 
 def _largest_spp(max_depth: int) -> int:
-    """Return the largest number of paths of a pixel whose vertices fit into the local memory of one lane."""
+    """Return the largest number of paths for which one lane can store the vertices of all paths in local memory."""
     device = device_of(mi.variant())
     return device.most_records(LARGEST_RECORD, MAX_DEPTH) // device.room(max(max_depth, 1))
 
@@ -32,7 +32,7 @@ def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) ->
     `pixel_sweep` requires an rgb image without alpha, an independent sampler, and a camera without motion and with an
     instantaneous shutter. The filter must be a box, so that each path belongs to one pixel. If only ``some`` pixels are
     rendered, any non-negative filter can be used (see `FilterSamples`). The number ``spp`` of paths of a pixel must be
-    at least two, and the vertices of these paths must together fit into the local memory of one lane.
+    at least two, and the vertices of these paths must fit together into the local memory of one lane.
 
     The returned text can follow the word "since" in a message.
     """
@@ -100,7 +100,7 @@ def _position_sampler(film: mi.Film, corner: mi.Point2f) -> Callable[[mi.Point2f
 def pixel_loss(
     view: Pass, max_depth: int, offset: mi.TensorXf, slope: mi.TensorXf, pixels: mi.UInt32 | None
 ) -> PixelLoss:
-    """Gather the loss derivative for the pixel of each lane.
+    """Gather the loss derivative, ``offset`` + ``slope`` · image, for the pixel of each lane.
 
     There is one lane for each pixel of the film or, if ``pixels`` is given, one lane for each entry of ``pixels``. In
     the second case, ``offset`` and ``slope`` have one row per entry.

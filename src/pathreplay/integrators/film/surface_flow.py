@@ -1,11 +1,12 @@
-"""Flow of a static camera: film positions follow the visible surfaces, which then move little relative to them.
+"""Flow of a static camera: film positions follow the visible surfaces.
 
-A few probe rays sample the scene. A point p that a probe ray hits moves with its surface. The image of p
+The surfaces then move little relative to the film positions. A few probe rays sample the scene. Let p be the point at
+which a probe ray hits a surface, and t the distance of p on the ray. The point p moves with the surface. The image of p
 moves on the film with the velocity
 
     u = (∂(o + t d)/∂s)⁺ ∂p/∂π,
 
-where o + t d is the point at the same distance t on the ray through the film position s. If film positions are fixed,
+where o + t d is the point at the distance t on the ray through the film position s. If film positions are fixed,
 the hit point of a ray slides over the surface with a speed proportional to u / cos, where cos is the cosine between
 normal and ray. This speed is unbounded at silhouettes. Points at grazing angles therefore have the largest weights. The
 velocity at a node of a grid is the mean
@@ -13,10 +14,12 @@ velocity at a node of a grid is the mean
     v = Σ K W u / (K_0 + Σ K (W + S)),     W = 1 / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
 
 over nearby points, where r is their distance from the node on the film. Static points contribute with u = 0. Between
-nodes, v is interpolated. The constant K_0 is the weight of v = 0. In a narrow field of view, u is large, and film
-positions that follow u cause more noise than fixed film positions. S is inversely proportional to the square of the
-field of view, and reduces v in this case. Every v gives the same derivative of the image (see `camera_flow`). With this
-v, little motion is left for the interior and boundary terms.
+nodes, v is interpolated. The constant K_0 is the weight of the velocity zero. In a narrow field of view, u is large,
+and film positions that follow u cause more noise than fixed film positions. S is inversely proportional to the square
+of the field of view, so S reduces v in a narrow field of view.
+
+The derivative of the image does not depend on the choice of v (see `camera_flow`). With the choice above, the interior
+and boundary terms have to differentiate little motion.
 """
 
 from __future__ import annotations

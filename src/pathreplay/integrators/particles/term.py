@@ -31,7 +31,7 @@ class ParticleTerm:
     """
 
     max_depth: int  # depth of the whole path from emitter to sensor, counted as in Mitsuba
-    caustics: bool  # whether only the paths that `TraceConfig.without_caustics` omits are traced
+    caustics: bool  # trace only the paths that `TraceConfig.without_caustics` omits, not all light paths
 
     @staticmethod
     def require_no_media(trace: TraceConfig) -> None:

@@ -1,14 +1,15 @@
 """Initial height maps of lenses and mirrors that cast a given image as their caustic, computed by optimal transport.
 
-Gradients of renderings change a caustic locally, and end in local minima if light has to travel far across the image.
-The initial height map therefore transports the light first, as in Schwartzburg et al. (2014) and Sun et al. (2024):
+Gradients of renderings change a caustic only locally. An optimisation with these gradients ends in a local minimum if
+light has to travel far across the image. The initial height map therefore comes from optimal transport of the light, as
+in Schwartzburg et al. (2014) and Sun et al. (2024):
 
 1. Optimal transport assigns a point T(x) of the receiver to each point x of the surface.
 2. Snell's law or the law of reflection gives the normal that directs the light at x to T(x).
-3. A Poisson equation gives the heights. They minimise the mean squared difference between the slopes of the heights
-   and the slopes that belong to the normals.
+3. A Poisson equation gives the heights. These heights minimise the mean squared difference between their slopes and
+   the slopes of a surface with the normals of step 2.
 
-For small slopes, the shift of the light on the receiver is proportional to the slope. The transport then minimises the
+For small slopes, the light is shifted on the receiver in proportion to the slope. The transport then minimises the
 mean square slope. The optimal T is the gradient of a potential, so the slopes of step 2 are nearly the gradient of a
 height map.
 
@@ -123,9 +124,10 @@ def _resampled(density: Field, shape: tuple[int, int]) -> Field:
 def _sources(φ: Field, aspect: float, margin: int = 0) -> tuple[Field, Field]:
     """Return the point S(y) of the surface from which light arrives at y, for each cell y of the receiver.
 
-    S is the gradient of the potential v = |y|²/2 + φ(y) for cells of width ``aspect`` and height 1 (see
-    `monge_ampere`), scaled to the extent of the surface. The results are the row and the column of S(y), in units of
-    cells. A ``margin`` adds cells beyond the border, where the potential is continued by reflection at the border.
+    S is the gradient of the potential v = |y|²/2 + φ(y) (see `monge_ampere`), scaled to the extent of the surface. The
+    cells of the potential have the width ``aspect`` and the height 1. The results are the row and the column of S(y),
+    in units of cells. A ``margin`` adds results for cells beyond the border. The potential is continued there by
+    reflection at the border.
     """
     p = np.pad(φ, margin + 1, mode="symmetric")
     rows, columns = (np.arange(-margin, n + margin) for n in φ.shape)

@@ -83,7 +83,8 @@ class Optics:
     def incidence(self, x: Field, y: Field, z: Field) -> tuple[Field, Field]:
         """Return the direction of incident light (..., 3) at points, and its flux per area of a plane z = const.
 
-        Light that falls on a slab has been refracted at its entry surface. The flux has an arbitrary scale.
+        In a slab, the direction is the direction after refraction at the entry surface. The flux has an arbitrary
+        scale.
         """
         if self.eta is not None and self.source_distance is not None:
             return self._refracted(x, y, z, self.eta, self.source_distance)

@@ -66,7 +66,7 @@ RENAMED = {
 
 
 def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[str, type[BaseModel]]) -> str:
-    """Describe one error of a job in a single line: location, value and remedy. Unknown keys are described first.
+    """Describe one error of a job in a single line: location, value and remedy. An unknown key has precedence.
 
     Args:
         error: pydantic's error for a whole job.

@@ -11,10 +11,11 @@ from pathreplay.types import Json
 
 
 class Optimizer(Table):
-    """An optimiser and its options; None stands for the value in `DEFAULTS`.
+    """An optimiser and its options. An option that is None has its value in `DEFAULTS`.
 
-    The options of Dr.Jit's optimisers keep their names. ``weight_decay`` acts on the optimised variable, which is not
-    the value itself if the parameter has a ``parameterization``.
+    The options of Dr.Jit's optimisers have the names that Dr.Jit gives them. ``weight_decay`` acts on the variable in
+    which the optimiser takes its steps. If the parameter has a ``parameterization``, this variable is not the value of
+    the parameter.
     """
 
     type: Literal["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b", "levenberg-marquardt"] = "adam"
@@ -72,7 +73,7 @@ class Optimizer(Table):
         return self.type == "levenberg-marquardt"
 
     def options(self) -> Json:
-        """Return all options of the type, with defaults for those that are not given."""
+        """Return all options of this type of optimiser, with default values for options that are not given."""
         return DEFAULTS[self.type] | self.model_dump(exclude={"type"}, exclude_none=True)
 
 

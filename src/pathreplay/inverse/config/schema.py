@@ -154,7 +154,7 @@ class Config(Table):
         return self.spp_shards * (2 if self.halves_samples else 1)
 
     def completed_entry(self, entry: Parameter) -> Parameter:
-        """Return a copy of a parameter's table that has values of ``learning_rate`` and ``refine_at``."""
+        """Return a copy of a parameter's table in which missing ``learning_rate`` and ``refine_at`` are filled in."""
         refine_at = entry.refine_at or []
         if entry.refine_at is None and entry.resolutions is not None and self.stages is not None:
             refine_at = begins(self.stages)[1 : len(entry.resolutions)]
@@ -175,7 +175,8 @@ class Config(Table):
         total = begins(self.stages or [])[-1]
         if self.stages is not None:
             if "iterations" not in self.model_fields_set:
-                # The model is frozen, so __dict__ is changed. The value does not count as given, and is not saved.
+                # The model is frozen, so the value is stored in __dict__. The key still counts as not given, and is not
+                # saved.
                 self.__dict__["iterations"] = total
             elif self.iterations != total:
                 raise ValueError(
@@ -224,7 +225,8 @@ class Config(Table):
             "final_learning_rate_ratio" in self.model_fields_set
             and "learning_rate_schedule" not in self.model_fields_set
         ):
-            # The model is frozen, so __dict__ is changed. The value does not count as given, and is not saved.
+            # The model is frozen, so the value is stored in __dict__. The key still counts as not given, and is not
+            # saved.
             self.__dict__["learning_rate_schedule"] = "exponential"
         if self.learning_rate_schedule == "constant" and "final_learning_rate_ratio" in self.model_fields_set:
             raise ValueError(
@@ -366,7 +368,7 @@ class Config(Table):
         return self
 
     def seeds(self, stream: int, sensor: int, iteration: int = 0, count: int = 2) -> tuple[int, ...]:
-        """Return ``count`` independent 32-bit seeds, which differ between streams, sensors and iterations."""
+        """Return ``count`` independent 32-bit seeds. Streams (`ITERATION` etc.), sensors and iterations share none."""
         return tuple(np.random.SeedSequence([self.seed, stream, iteration, sensor]).generate_state(count).tolist())
 
 

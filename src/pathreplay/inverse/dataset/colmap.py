@@ -67,7 +67,8 @@ def photos_of_colmap(
         images: folder of the images; default: ``../../images`` relative to the model.
         masks: folder of masks. A mask is named like its image with '.png' appended, as in COLMAP.
         size_of: returns the width and height of an image file.
-        missing: receives the names of images that do not exist, which are left out; None: they are an error.
+        missing: list to which the names of missing images are added. These images are left out. If the list is None, a
+            missing image is an error.
 
     Raises:
         PathreplayError: a file cannot be read, or the model is inconsistent or not supported.

@@ -69,7 +69,8 @@ def target_scene(
 ) -> mi.Scene:
     """Load the target scene, and set the parameters ``given`` (globs allowed) to their values.
 
-    8-bit textures that match a key in ``given`` or ``wanted`` are converted to floats.
+    8-bit textures are converted to floats if their key matches an entry of ``given`` or ``wanted``. The parameters
+    ``wanted`` are the parameters that the job recovers or derives.
     """
     scene = load_scene_with_floats(spec, [*given, *wanted], base, **arguments)
     params = traversed(scene)
@@ -103,7 +104,7 @@ def rendered_targets(
 ) -> dict[str, Image]:
     """Render the targets of all views, each with its own seed. Raises PathreplayError if the scene lacks a sensor."""
     plugin = target.integrator
-    assert plugin is not None  # `completed` fills in a missing integrator
+    assert plugin is not None  # `completed` has filled in a missing integrator
     integrator = load_integrator(plugin.model_dump())
     if len(scene.sensors()) <= max(sensors.values()):
         raise PathreplayError(
@@ -255,7 +256,10 @@ def masked(targets: Targets, masks: Mapping[str, Image]) -> Targets:
 
 
 def require_weights(targets: Targets, masked: set[str]) -> None:
-    """Raise PathreplayError unless all views in ``masked``, and no others, have weights, and all weights are valid."""
+    """Check the weights of views that were read from a run folder.
+
+    Raises PathreplayError if a view in ``masked`` has no valid weights, or if another view has weights.
+    """
     for name, image in targets.images.items():
         weight = targets.weights.get(name)
         shape = (*image.shape[:2], 1)
@@ -278,7 +282,7 @@ def by_view(what: str, files: list[str] | str, sensors: dict[str, int], base: Pa
 
 
 def _read(what: str, path: Path, name: str, shape: tuple[int, int, int], resize: bool, *, raw: bool = False) -> Image:
-    """Read an image. Unless ``resize`` is set, its size is compared with the film before it is decoded."""
+    """Read an image. Unless ``resize`` is set, first raise PathreplayError if image and film have different sizes."""
     (width, height), film = picture_size(path), (shape[1], shape[0])
     if not resize and (width, height) != film:
         raise PathreplayError(
@@ -305,7 +309,7 @@ def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str,
     Args:
         scene: the scene.
         sensors: index of each sensor, by name.
-        spp: samples per pixel by the key of the job that defines them, such as ``eval_spp``.
+        spp: numbers of samples per pixel, indexed by keys of the job such as ``eval_spp``.
     """
     pixels = 0
     for name, index in sensors.items():

@@ -70,7 +70,8 @@ def photos_of_json(
     Args:
         path: the file.
         size_of: returns the width and height of an image file.
-        missing: receives the names of images that do not exist, whose frames are left out; None: they are an error.
+        missing: list to which the names of missing images are added. The frames of these images are left out. If the
+            list is None, a missing image is an error.
 
     Raises:
         PathreplayError: a file cannot be read, or the capture is inconsistent or not supported.

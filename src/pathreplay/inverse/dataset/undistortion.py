@@ -73,7 +73,7 @@ class Lens:
 
     def _stretch(self, r: Plane) -> Plane:
         k = self.radial
-        with np.errstate(all="ignore"):  # non-finite values count as not monotonic
+        with np.errstate(all="ignore"):  # `bent` treats non-finite values as not increasing
             if self.fisheye:
                 θ = np.arctan(r)
                 θ2 = θ * θ

@@ -61,7 +61,7 @@ def sensors_of(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int
 
 
 def _place(item: int | str, ids: list[str], names: list[str]) -> int:
-    """Return the index of a sensor that is given by its id, name or index."""
+    """Return the index of the sensor ``item``, which is an id, a name or an index."""
     index = next((known.index(item) for known in (ids, names) if item in known), item)
     if not isinstance(index, int) or not 0 <= index < len(names):
         raise PathreplayError(

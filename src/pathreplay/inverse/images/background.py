@@ -1,4 +1,4 @@
-"""Background image of a view: the environment emitter as the camera of the view sees it without geometry."""
+"""Background image of a view: the environment emitter, as the camera would see it if there were no geometry."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SAMPLES = 256
 
 
 def background(scene: mi.Scene, sensor: int) -> Image:
-    """Render the environment emitter of a scene without geometry.
+    """Render the environment emitter of a scene as if the scene had no geometry.
 
     Args:
         scene: the scene.

@@ -1,4 +1,4 @@
-"""Store for rarely used arrays, such as images, which are kept in memory up to a budget and then on disk.
+"""Store for rarely used arrays, such as images. Arrays that exceed a memory budget are kept on disk.
 
 Arrays on disk are read-only memory maps of one unnamed temporary file, which is removed when the process ends.
 """

@@ -152,7 +152,7 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def oddities(path: Path) -> list[str]:
-    """Describe ignored metadata of an image. Each description begins with a verb and follows the image name."""
+    """Describe ignored metadata of an image. Each description is a predicate whose subject is the image."""
     notes = []
     # `read_image` reports errors. Pillow's warnings about large images are irrelevant here.
     with contextlib.suppress(Exception), warnings.catch_warnings():
@@ -215,7 +215,10 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
 
 def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Image:
-    """Resample an image (Lanczos, clamped to its range). If ``crop``, first crop its centre to the new aspect ratio."""
+    """Resample an image with a Lanczos filter, and clamp the result to the value range of the image.
+
+    With ``crop``, the borders of the image are first cropped to obtain the new aspect ratio.
+    """
     if crop:
         h, w = image.shape[:2]
         keep_h, keep_w = min(h, round(w * height / width)), min(w, round(h * width / height))

@@ -56,7 +56,8 @@ from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, s
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
 
-# Number of times that a job with a baseline measures the image errors. This takes a few per cent of the job's time.
+# Number of times that a job with a baseline measures the image errors. The measurements take a few per cent of
+# the job's time.
 JUDGEMENTS = 10
 
 # Smallest fraction of non-finite gradient entries for which an iteration counts towards `max_consecutive_nonfinite`.
@@ -164,7 +165,7 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
 
 
 def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
-    """Yield the events of `iterate`. Steps run inside the context `Problem.computing`, unlike the caller's code."""
+    """Yield the events of `iterate`. The context `Problem.computing` encloses the steps, but not the caller."""
     events = iterate(problem, run, stop)
     while True:
         with problem.computing():

@@ -43,8 +43,8 @@ def ratios(history: Sequence[Entry]) -> dict[str, float]:
 def next_spp(auto: AdaptiveSpp, history: Sequence[Entry]) -> int:
     """Return the samples per pixel of the next iteration, which depend on the history alone.
 
-    The number of samples can change only after it has been constant for `WINDOW` iterations or a multiple of them. The
-    number is doubled if the signal-to-noise ratio of at least one variable is below the target. It is halved if the
+    The number of samples can change only after it has been constant for a multiple of `WINDOW` iterations. The number
+    is doubled if the signal-to-noise ratio of at least one variable is below the target. It is halved if the
     ratios of all variables are above twice the target. Half the samples give at least half the ratio, so the ratios
     then stay above the target.
     """

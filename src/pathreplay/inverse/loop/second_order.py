@@ -17,7 +17,7 @@ from pathreplay.inverse.problem.problem import Problem
 
 
 def draw_of(optimiser: Optimiser, iteration: int, searches: bool) -> tuple[int, bool]:
-    """Select the random numbers of an iteration, and whether its Gauss-Newton model is evaluated.
+    """Return which random numbers an iteration uses, and whether its Gauss-Newton model is evaluated.
 
     Args:
         optimiser: the optimiser.
@@ -25,7 +25,8 @@ def draw_of(optimiser: Optimiser, iteration: int, searches: bool) -> tuple[int, 
         searches: whether all iterations use the same random numbers, see `Optimizer.searches`.
 
     Returns:
-        An index and the value of `Shard.second_order`. Iterations with the same index use the same random numbers.
+        An index of random numbers, and the value of `Shard.second_order`. Iterations with equal indices use equal
+        random numbers.
     """
     if isinstance(optimiser, LevenbergMarquardt):
         return optimiser.draw, True
@@ -35,7 +36,7 @@ def draw_of(optimiser: Optimiser, iteration: int, searches: bool) -> tuple[int, 
 def observe(problem: Problem, optimiser: Optimiser, values: Arrays, evaluation: Evaluation) -> None:
     """Pass the Gauss-Newton model of an evaluation to a second-order optimiser.
 
-    The model includes the regularizers. It is expressed in the latent variables, which the optimiser steps.
+    The model includes the regularizers. Its variables are the latent variables, in which the optimiser takes its steps.
     """
     model = evaluation.model
     if not isinstance(optimiser, LevenbergMarquardt) or model is None:
