@@ -1,7 +1,7 @@
 """Rendering as a function of JAX arrays: images, and gradients of a JAX loss.
 
-Images and gradients are computed by Python callbacks (`jax.pure_callback`), which `jax.jit`, `jax.grad` and `jax.vmap`
-(sequential) support.
+Images and gradients are computed by Python callbacks (`jax.pure_callback`). The transformations `jax.jit`, `jax.grad`
+and `jax.vmap` can be applied. With `jax.vmap`, the images are rendered one after the other.
 """
 
 from __future__ import annotations

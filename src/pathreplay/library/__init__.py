@@ -1,4 +1,4 @@
-"""The library: inverse problems of scenes and images in memory, their gradients, and their minimisation."""
+"""The Python library: inverse problems with scenes and images in memory, gradients of their loss, and optimisation."""
 
 from pathreplay.library.descriptions import Derived, Parameter, View
 from pathreplay.library.gradients import value_and_grad

@@ -89,7 +89,7 @@ class View:
         sensor: index or id of the sensor.
         target: linear pixels (height, width, channels): a NumPy or Dr.Jit array, a `mi.Bitmap`, or an image file.
         weight: nonnegative pixel weights (height, width), normalised to mean 1. Default: equal weights.
-        share: weight of the view relative to the others.
+        share: weight of the view relative to the other views.
         test: whether the view is a test view.
     """
 

@@ -125,7 +125,7 @@ def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tu
 
 def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
     config = problem.config
-    held = {v.key for v in problem.variables} if config.stages else set()  # a stage may freeze any variable
+    held = {v.key for v in problem.variables} if config.stages else set()  # a stage may have frozen any variable
     before = go_on(folder.path, problem, run, held)
     # A run that has taken all its iterations can still lack a report, for example because the disk was full. It is
     # resumed only to write its results.

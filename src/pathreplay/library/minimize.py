@@ -205,9 +205,10 @@ def _folder_run(
 def _observers(
     bar: Progress | NotebookPanel, built: inner.Problem, run: Run, stop: Stop, kept: FolderRun | None
 ) -> list[Callable[[Event], None]]:
-    """Return the observers of events, other than the progress display.
+    """Return the functions that receive the events of the run, besides the progress display.
 
-    If there is a run folder, its writer is the observer. Otherwise, a notebook has an observer that renders images.
+    With a run folder, the writer of the folder receives the events. Without a run folder, a notebook gets an observer
+    that renders images.
     """
     if kept is not None:
         if isinstance(bar, NotebookPanel):

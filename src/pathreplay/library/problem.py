@@ -219,7 +219,7 @@ class Problem:
             A problem with the same scene and targets, and with the job's settings overridden by the changes.
 
         Raises:
-            PathreplayError: a setting is invalid, or fixed when the problem is created.
+            PathreplayError: a setting is invalid, or can be set only when the problem is created.
         """
         if fixed := sorted(OF_A_PROBLEM & set(changes)):
             raise PathreplayError(f"{name}: '{fixed[0]}' belongs to the problem; give it to Problem")
@@ -267,9 +267,9 @@ def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
 
 
 def _loaded(scene: object, job: Json, base: Path) -> tuple[mi.Scene, tuple[str, ...]]:
-    """Load a scene so that the job's parameters are differentiable; returns the scene and notes on changes.
+    """Load a scene so that the job's parameters are differentiable. Returns the scene and notes on changes.
 
-    A loaded scene is returned unchanged. See `load_scene_for`.
+    If ``scene`` is a `mi.Scene`, it is returned unchanged. See `load_scene_for`.
     """
     if isinstance(scene, mi.Scene):
         return scene, ()

@@ -24,7 +24,8 @@ from pathreplay.library.problem import Problem, run_settings
 class _Task:
     """Settings, kernels and optimiser that all states of an optimisation share.
 
-    The optimiser has the internal state that belongs to the `State` ``at``, or to an unknown `State` if ``at`` is None.
+    The internal state of the optimiser belongs to the `State` in ``at``. If ``at`` is None, it is unknown to which
+    `State` the internal state belongs.
     """
 
     def __init__(self, changes: Mapping[str, object]) -> None:
@@ -49,7 +50,7 @@ class _Task:
         if self.optimiser is None or self.at is not state:
             self.optimiser = self.own or optimiser_of(built, state._next, built.config.optimizer)
             self.optimiser.restore(state._kept, latents(built.variables, state._next))
-        self.at = None  # unknown until the step that follows has succeeded
+        self.at = None  # a failed step would leave the optimiser in an unknown state; a successful step sets `at` again
         return self.optimiser
 
 

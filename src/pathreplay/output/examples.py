@@ -36,7 +36,7 @@ def write_examples(folder: Path) -> str:
         folder: folder to create; it may exist if it is empty.
 
     Returns:
-        The message for the user: the jobs, and how to run the first.
+        The message for the user: the paths of the jobs, and a command that runs one of them.
 
     Raises PathreplayError if the folder exists and is not empty, or cannot be written.
     """

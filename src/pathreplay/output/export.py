@@ -145,7 +145,9 @@ def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
 
 
 def _beside(export: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
-    """Return the content of the files that the scene does not reference, by name: PNG, OBJ, NPY, cameras, and numbers.
+    """Return the content of the additional files, which the scene does not reference, by file name.
+
+    The files are PNG, OBJ and NPY files, and JSON files of cameras and of small values.
 
     ``free`` are parameters outside the scene. A parameter in ``free`` with more than 16 numbers becomes an NPY file.
     """

@@ -22,7 +22,7 @@ from pathreplay.scenes.descriptions import errors_as
 
 # Samples per pass of the `independent` sampler. Passes take a few seconds, so that Ctrl-C takes effect soon.
 _A_PASS = 2**24
-# Bytes per sample during a pass, for two copies of the state of its random number generator.
+# Bytes per sample during a pass. Each sample has two copies of the state of its random number generator.
 _A_SAMPLE = 64
 # Largest width and height in pixels. A larger size is probably a typo. Mitsuba would at best raise an error.
 _LARGEST_SIDE = 2**16

@@ -140,7 +140,7 @@ def _alike(value: object, other: object) -> bool:
     try:
         a, b = (_numbers(x) for x in (value, other))
     except (TypeError, ValueError):
-        return True  # values that are not numeric arrays, such as scalar vectors: no run optimizes them
+        return True  # values that are not numeric arrays are not compared: no run optimizes them
     if a.size == 0 or b.size == 0:
         return a.size == b.size
     a, b = (x.astype(np.float64).ravel() for x in (a, b))

@@ -35,9 +35,10 @@ SMOOTH, SMOOTH_COLOUR = 1.0, 0.5
 def export_surface(run: Path, output: Path | None = None) -> str:
     """Export the surface of a recovered density grid, with its radiance as a colour per vertex.
 
-    The folder contains `scene.xml`, which Mitsuba renders with `path` and without this package, the mesh as PLY, and
-    the sky. The density at the surface is the one of `THICKNESSES` whose images are closest to the photos in `COMPARED`
-    views, up to a factor per colour. Fainter parts of the grid are left out.
+    The folder contains `scene.xml`, the mesh as PLY, and the sky. Mitsuba renders the scene with `path` and without
+    this package. For each thickness in `THICKNESSES`, the surface is extracted and rendered in up to `COMPARED` views.
+    The surface whose images are closest to the photos, up to a factor per colour, is exported. Parts of the grid with a
+    lower density than the surface are left out.
 
     Args:
         run: run folder of a job that recovered `sigma_t` and `radiance` of one `gridmedium`.
@@ -96,7 +97,10 @@ def _placed(job: Job) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _compared(run: Path, cameras: list[SceneDict]) -> list[tuple[SceneDict, np.ndarray]]:
-    """Return cameras, evenly spaced in the capture, whose photos the run has saved, with these photos."""
+    """Return pairs of a camera and its photo, for at most `COMPARED` cameras whose photos the run has saved.
+
+    The cameras are evenly spaced in the order of the capture.
+    """
     found = [(camera, path) for camera in cameras if (path := run / "images" / f"target-{camera['id']}.exr").is_file()]
     views = []
     for camera, path in found[:: -(-len(found) // COMPARED) or 1]:
@@ -146,7 +150,7 @@ def emitting_mesh(
     slopes = np.stack([_at(component, points) for component in np.gradient(smooth)][::-1], axis=1)
     lengths = np.linalg.norm(slopes, axis=1, keepdims=True)
     inner = points + DEPTH * np.divide(slopes, lengths, out=np.zeros_like(slopes), where=lengths > 0)
-    weight = np.maximum(_at(thick, inner), 1e-6 * level)  # dense voxels determine the colour
+    weight = np.maximum(_at(thick, inner), 1e-6 * level)  # the colour is a mean that is weighted by density
     colours = np.stack([_at(emitted[..., k], inner) / weight for k in range(3)], axis=1)
     mesh = compat.new_mesh(low + (points + 0.5) * voxel, triangles, mi.Properties(), flat=True)
     mesh.add_attribute("vertex_color", 3, np.maximum(colours, 0).astype(np.float32).ravel())

@@ -49,7 +49,10 @@ def surface(density: NDArray[np.floating], level: float) -> tuple[NDArray[np.flo
 
 
 def _means_of_crossings(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean crossing of each cell, relative to its first corner, from the values at its corners."""
+    """Return the mean of the crossings on the edges of each cell, relative to the first corner of the cell.
+
+    ``values`` are the values at the corners of the cells, minus the level.
+    """
     total, count = np.zeros((len(values), 3)), np.zeros((len(values), 1))
     for a, b in _EDGES:
         va, vb = values[:, a], values[:, b]
@@ -62,7 +65,7 @@ def _means_of_crossings(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _quads(inside: NDArray[np.bool_], number: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
-    """Return the two triangles of each lattice edge along an axis that crosses the level."""
+    """Return two triangles for each lattice edge that is parallel to ``axis`` and crosses the level."""
     first = np.take(inside, range(inside.shape[axis] - 1), axis)
     second = np.take(inside, range(1, inside.shape[axis]), axis)
     at = np.argwhere(first != second)  # the padding keeps these edges away from the border
@@ -74,7 +77,8 @@ def _quads(inside: NDArray[np.bool_], number: NDArray[np.int64], axis: int) -> N
         cell[:, v] += dv
         around.append(number[tuple(cell.T)])
     quad = np.stack(around, axis=1)
-    # Seen along the axis, the four cells turn counter-clockwise; the array order (z, y, x) mirrors this.
+    # In world space, seen from the positive end of the axis, the four cells are in clockwise order, because the array
+    # order (z, y, x) is a mirror image of (x, y, z). If the density falls along the axis, the order is reversed.
     falls = first[tuple(at.T)]
     quad[falls] = quad[falls][:, ::-1]
     return np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])

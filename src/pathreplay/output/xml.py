@@ -28,7 +28,7 @@ _UNNAMED = "_arg_"
 def scene_xml(described: Described, from_file: bool) -> bytes:
     """Encode a scene description as an XML file.
 
-    ``from_file`` means that the description was read from a file, in which the user has chosen the ids. Raises
+    If the description was read from a file (``from_file``), the user has chosen the ids in this file. Raises
     PathreplayError for values that XML cannot represent.
     """
     uses = Counter(id(child) for node in described.nodes for _, child in described.children(node))

@@ -99,8 +99,8 @@ def particle_tangent(
 ) -> tuple[mi.TensorXf, bool]:
     """Compute the tangent of the image from the tangents of the parameters.
 
-    Returns the tangent, and whether light paths move with the parameters. ``lost`` counts the paths whose tangent was
-    not finite and was dropped.
+    Returns the tangent, and whether the parameters move the vertices or the film positions of light paths. ``lost``
+    counts the paths whose tangent was not finite and was dropped.
     """
     sums = dr.zeros(mi.Float, 4 * film.pixels)
     i = dr.arange(mi.UInt32, particles.lanes)
@@ -144,9 +144,10 @@ def particle_sweep(
 ) -> bool:
     """Back-propagate the adjoint ``grad_in`` of the image into the parameters.
 
-    Returns whether light paths move with the parameters. Each path is recorded, and its vertices are differentiated
-    from the last to the first, as in `sweep`. Visibility is not differentiated. With ``attach='none'``, motion is not
-    differentiated either. ``lost`` counts the paths whose gradient is incomplete.
+    Returns whether the parameters move the vertices or the film positions of light paths. Each path is recorded, and
+    its vertices are differentiated from the last to the first, as in `sweep`. Visibility is not differentiated. With
+    ``attach='none'``, the motion of paths is not differentiated either. ``lost`` counts the paths whose gradient is
+    incomplete.
 
     Raises PathreplayError if ``max_depth`` exceeds `deepest`, or if the paths depend on no parameter with gradients.
     """

@@ -42,7 +42,7 @@ class EmitterSamples:
     """The random numbers of the first ray."""
 
     time: mi.Float
-    emitter: mi.Float  # selects the emitter, and then the wavelengths
+    emitter: mi.Float  # selects the emitter, and is reused to sample the wavelengths
     place: mi.Point2f
     direction: mi.Point2f
 
@@ -112,7 +112,8 @@ class Emission:
         time = mi.Float(self.sensor.shutter_open()) + u.time * self.sensor.shutter_open_time()
         ray, weight = emitter.sample_ray(time, again, u.place, u.direction, active)
         if self.maps:
-            # Mitsuba 3.9 does not rotate the disk of origins with the environment map. Compute the origin again.
+            # Mitsuba 3.9 samples origins on a disk that does not rotate with the environment map. Compute the origin
+            # again.
             box = self.scene.bbox()
             radius = 0.5 * math.sqrt(sum(float(x) ** 2 for x in box.extents()))
             disk = mi.warp.square_to_uniform_disk_concentric(u.place)
@@ -132,7 +133,7 @@ def _require_rays(emitter: mi.Emitter) -> None:
     try:
         if known:
             emitter.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
-    except RuntimeError:  # a texture that cannot be sampled
+    except RuntimeError:  # the emitter has a texture that Mitsuba cannot sample
         known = False
     if not known:
         raise PathreplayError(
@@ -160,9 +161,9 @@ def _origin(
 
 
 def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-    """Return a factor of value 1, whose derivative is that of the logarithm of the emitting triangle's area.
+    """Return the factor A / A_0, where A is the area of the emitting triangle and A_0 is its detached value.
 
-    Mitsuba's `sample_ray` omits this derivative.
+    The factor is 1, but its derivative is the derivative of log A, which Mitsuba's `sample_ray` omits.
     """
     hit, back, on_mesh = _origin(trace, emitter, ray, active)
     area = dr.norm(surface_point(hit, back, on_mesh).A)

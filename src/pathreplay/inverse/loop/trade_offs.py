@@ -7,7 +7,8 @@ moving everything else in the opposite direction.
 
 `trade_offs` computes the smallest principal angle between the column spaces of two parameters. If the angle is zero, a
 change of one parameter can be undone by a change of the other parameter, and the images determine only the combined
-effect. An example is the radiance of an emitter and the reflectance of the surface that the emitter lights.
+effect. For example, the images may determine only the product of an emitter's radiance and the reflectance of the
+surface that the emitter lights.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ Columns = Mapping[str, NDArray[np.float64]]
 
 
 def trade_offs(columns: Columns) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of variables whose principal angle has a sine below `UNDONE`."""
+    """Return the pairs of variables for which the sine of the smallest principal angle is below `UNDONE`."""
     spans = {key: np.linalg.qr(column / np.linalg.norm(column, axis=0))[0] for key, column in columns.items()}
     pairs = []
     for a, b in combinations(spans, 2):
@@ -61,11 +62,11 @@ def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Colu
     Args:
         problem: the problem.
         values: values of the variables.
-        taken: number of samples that the run has used, which determines the budget of samples (see `SHARE`).
+        taken: number of samples that the run has used. It limits the samples for the Jacobian (see `SHARE`).
 
     Returns:
-        The columns by variable, and the variables that do not affect the images. Both are empty if there are too many
-        variables, if a variable is too large, or if rendering all views would be too expensive.
+        The columns by variable, and the variables that do not affect the images. Both results are empty if there are
+        too many variables, if a variable is too large, or if rendering all views would be too expensive.
     """
     variables = [v for v in problem.variables if v.key not in (EXPOSURE, RESPONSE)]
     if any(values[v.key].size >= LARGE for v in variables) or len(variables) > MOST_COLUMNS:
@@ -98,7 +99,7 @@ def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Colu
 def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
     """Render all training views with common random numbers.
 
-    Returns the pixels of all views in one vector, multiplied by the square roots of their weights.
+    Returns the pixels of all views in one vector. Each pixel is multiplied by the square root of its weight.
     """
     pictures = []
     for view in problem.trained().values():
@@ -108,7 +109,10 @@ def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
 
 
 def _changes(variable: Variable, value: Array, few: int = FEW) -> list[Array]:
-    """Make small perturbations of a value: one per entry, or a single one if there are more than ``few`` entries."""
+    """Make small perturbations of a value.
+
+    Up to ``few`` entries are perturbed one by one. More entries are perturbed together, by a single perturbation.
+    """
     size = STEP * variable.learning_rate
     if value.size <= few:
         size += STEP * (_length(value) + _length(value - variable.start))

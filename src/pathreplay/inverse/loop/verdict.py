@@ -59,7 +59,8 @@ def _listed(keys: Sequence[str]) -> str:
 def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     """Assess a run.
 
-    If the run was ``stopped`` early, the groups ``trade_offs`` and ``unseen`` stay empty, because they need renderings.
+    If the run was ``stopped`` early, the groups ``trade_offs`` and ``unseen`` stay empty, because these groups need
+    additional renderings.
     """
     moves = {v.key: still_moves(run.history, v.key, _begin(problem, v.key, run)) for v in problem.variables}
     known = [key for key, moving in moves.items() if moving is not None]
@@ -78,13 +79,14 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
         # User functions or Mitsuba may reject perturbed values. The run itself has succeeded, so no error is reported.
         return Verdict(moving, arrived)
     # Variables with a nonzero gradient affect the images, even if their finite differences in `columns_of` are zero.
-    # The differences are zero if the perturbation moves no silhouette across a sample.
+    # For example, the differences of a variable that only moves silhouettes are zero if no sample lies between the
+    # silhouettes before and after the perturbation.
     pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
     return Verdict(moving, arrived, pairs, tuple(key for key in unseen if key not in pulled))
 
 
 def _begin(problem: Problem, key: str, run: Run) -> int:
-    """Return the iteration since which neither the stage of the job nor the resolution of a variable has changed."""
+    """Return the iteration of the last change of the job's stage or of a variable's resolution; 0 without a change."""
     stages = begins(problem.config.stages or [])[:-1]
     levels = next(v.levels for v in problem.variables if v.key == key)
     return max(at for at in (0, *stages, *(levels.begins if levels else ())) if at <= len(run.history))

@@ -44,7 +44,7 @@ def scale_invariant(image: mi.TensorXf, target: mi.TensorXf, weight: mi.TensorXf
 def ssim(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
     """Compute 1 - SSIM for each pixel and channel, on sRGB-encoded colours that are not clipped at white.
 
-    Window and constants follow Wang et al. 2004, as in the reported metric (`Likeness`).
+    Window and constants follow Wang et al. 2004. The SSIM in reports (`Likeness`) uses the same window and constants.
     """
     a, b = _encoded(image), _encoded(target)
     μ, ν = _blurred(a), _blurred(b)

@@ -39,7 +39,7 @@ def l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 def l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Compute (I - T)². The gradient is unbiased. The expected value includes the variance of I."""
+    """Compute (I - T)². The gradient is unbiased. The expected loss includes the variance of I."""
     return dr.square(image - target)
 
 
@@ -51,9 +51,8 @@ def relative_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 def display_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
     """Compute ((I - T) s'(T))², where s' is the derivative of the sRGB encoding.
 
-    The argument T of s' is clamped to [0.01, 1].
-
-    To first order, this is the squared difference of images on a display. The gradient is unbiased, as for ``l2``.
+    In s'(T), the target T is clamped to [0.01, 1]. To first order, the loss is the squared difference of the
+    sRGB-encoded images. The gradient is unbiased, as for ``l2``.
     """
     slope = (1.055 / 2.4) * dr.power(dr.clip(target, DISPLAY_FLOOR, 1), 1 / 2.4 - 1)
     return dr.square((image - target) * slope)
@@ -121,7 +120,8 @@ def find_loss(name: str, modules: Modules | None = None) -> Loss:
     """Return the loss of this name, or import a user function ``module:function``.
 
     ``modules`` finds and imports user functions; by default, only installed modules are searched. Raises
-    PathreplayError if the name is unknown or the import fails. For an unknown name, the message suggests the nearest.
+    PathreplayError if the name is unknown or the import fails. For an unknown name, the message suggests a similar
+    name.
     """
     if name in LOSSES:
         return LOSSES[name]

@@ -1,1 +1,4 @@
-"""The objective: loss and gradients as a function of the values, evaluated for some of the views at a time."""
+"""The objective: the loss and its gradients as a function of the variables.
+
+Each evaluation computes the contribution of some of the views.
+"""

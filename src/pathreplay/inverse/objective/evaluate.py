@@ -60,15 +60,15 @@ class Shard:
     pixels: int | None = None
     """Number of random pixels per view; None: all pixels."""
     second_order: bool = False
-    """Whether the Gauss-Newton model is evaluated as well, from forward passes; see `jacobian`."""
+    """Whether the Gauss-Newton model is evaluated as well, by forward-mode differentiation; see `jacobian`."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Contribution of a shard to the loss, which is the mean over the training views, and to its gradients.
+    """Contribution of a shard to the loss and to the gradients of the loss.
 
-    Gradients are indexed by the key of the variable. They are unbiased for the losses in `QUADRATIC`. The expected loss
-    includes the variance of the images.
+    The loss is the mean over the training views. The gradients are indexed by the key of the variable. The gradients
+    are unbiased for the losses in `QUADRATIC`. The expected loss includes the variance of the images.
     """
 
     loss: float
@@ -99,7 +99,10 @@ class Total:
         self._model: GaussNewton | None = None
 
     def add(self, each: Evaluation) -> None:
-        """Add an evaluation. In an ``owned`` sum, later additions overwrite the arrays of the first evaluation."""
+        """Add an evaluation.
+
+        If the sum was created with ``owned``, later additions overwrite the arrays of the first evaluation.
+        """
         for key, gradient in each.gradients.items():
             if self._count:
                 gradient = np.add(self._sums[key], gradient, out=self._room(key))
@@ -168,21 +171,27 @@ class Local:
 
 
 def _taken(gradient: dr.ArrayBase) -> Array:
-    """Convert a gradient to NumPy. The result shares memory with Dr.Jit for large grids."""
+    """Convert a gradient to NumPy. For large grids, the result shares memory with Dr.Jit."""
     if dr.is_tensor_v(gradient) and dr.width(gradient) >= LARGE and dr.type_v(gradient) == dr.VarType.Float32:
         return gradient.numpy()
     return get_array(gradient)
 
 
 def release(values: Arrays) -> None:
-    """Free Dr.Jit's cache of unused memory if it may be large. Raises PathreplayError above the memory limit."""
+    """Free Dr.Jit's cache of unused memory if the cache may be large.
+
+    Raises PathreplayError if the process uses more memory than the memory limit.
+    """
     if any(value.size >= LARGE for value in values.values()) or memory.is_crowded():
         dr.flush_malloc_cache()
     memory.require_kept()
 
 
 def owned_tensor(picture: Array) -> mi.TensorXf:
-    """Copy an image into memory that Dr.Jit owns, for the reason given in `variables_of`."""
+    """Copy an image into memory that Dr.Jit owns.
+
+    The alignment of NumPy arrays varies, which would make frozen functions record again.
+    """
     tensor = mi.TensorXf(np.ascontiguousarray(picture)) * dr.opaque(mi.Float, 1)
     dr.eval(tensor)
     return tensor
@@ -244,7 +253,7 @@ class Evaluator:
         self._learned, self._at = learned, self.integrator.baseline
 
     def _second_order(self, values: Arrays, view: int, seed: int, spp: int) -> Evaluation:
-        """Evaluate a view by forward passes."""
+        """Evaluate loss, gradient and Gauss-Newton model of a view by forward-mode differentiation."""
         sensor_of(self.problem, self.problem.views[view])
         if self._jacobians is None:
             self._jacobians = Jacobians(self.problem, self.integrator, self._moving, self.freezes)
@@ -275,8 +284,8 @@ class Evaluator:
             return self._view(values, view, seed, spp, pixels)
         gradients = {}
         for key, value in moving.items():
-            gradients[key] = _taken(dr.grad(value))  # The gradient is zero if no parameter affects the view.
-            dr.clear_grad(value)  # The scene keeps a reference to the variable, and thus its gradient.
+            gradients[key] = _taken(dr.grad(value))  # The gradient is zero if the variable does not affect the view.
+            dr.clear_grad(value)  # The scene refers to the variable, which would keep the gradient in memory.
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
@@ -293,9 +302,9 @@ class Evaluator:
     def _differentiated(
         self, values: Arrays, view: int, seed: int, spp: int, factor: Array | None, batch: Batch | None
     ) -> tuple[float, mi.TensorXf | None, mi.TensorXf | None]:
-        """Return the view's contribution to the loss, and the derivatives with respect to ``factor`` and target.
+        """Return the view's contribution to the loss, and the derivatives with respect to ``factor`` and to the target.
 
-        The gradients of scene parameters are accumulated in the parameters themselves.
+        A derivative that is not needed is None. The gradients of scene parameters are accumulated in the parameters.
         """
         problem, about = self.problem, self.problem.views[view]
         sensor, picture, counts = about.sensor, linearized(values, about.target), about.weight
@@ -303,7 +312,7 @@ class Evaluator:
             picture, counts = batch.rows(picture), None if counts is None else batch.rows(counts)
         others = (None if part is None else owned_tensor(part) for part in (counts, factor))
         target = ViewTarget(owned_tensor(picture), *others)
-        # The first call is not recorded, because scenes create some parts when they are first rendered.
+        # The first call is not recorded, because Mitsuba creates some parts of a scene during its first rendering.
         which = view, spp, batch is not None
         records = self.freezes and which in self._sweeps
         if which not in self._sweeps:

@@ -88,7 +88,7 @@ class ViewResult:
     by_factor: mi.TensorXf | None
     """Derivative with respect to the logarithm of `ViewTarget.factor`, per channel."""
     by_target: mi.TensorXf | None = None
-    """Derivative with respect to the target, at fixed weights of a relative loss."""
+    """Derivative with respect to the target. The divisor of a relative loss is treated as a constant."""
 
 
 class NotRecordable(Exception):
@@ -96,7 +96,7 @@ class NotRecordable(Exception):
 
 
 def is_recordable(integrator: StatefulIntegrator, has_media: bool) -> bool:
-    """Return whether passes of the integrator can be recorded, as far as this is known before the first recording."""
+    """Return whether passes of the integrator can be recorded. Some obstacles show only in the first recording."""
     # Spectral variants read Mitsuba's tables of colour matching functions, which are not inputs of frozen functions.
     return not mi.is_spectral and integrator.is_recordable(has_media)
 
@@ -205,7 +205,7 @@ def _differentiate(
         value *= share
         if dr.grad_enabled(value):
             dr.backward(value)
-            apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # the seed that `mi.render` would use
+            apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # `mi.render` derives the same seed
             state = integrator.gradient_pass(apart, reduce(add, map(dr.grad, images)), state)
     by_factor = None
     if factor is not None and loss.by_factor:
@@ -229,7 +229,7 @@ def _halves(view: Pass) -> list[Pass]:
 def _extrapolated(
     loss: Loss, target: ViewTarget, images: list[mi.TensorXf], shares: list[float]
 ) -> tuple[mi.Float, mi.TensorXf]:
-    """Return the loss that is extrapolated to an image without noise, and the mean of the independent ``images``.
+    """Extrapolate the loss to an image without noise. Returns this loss, and the mean of the independent ``images``.
 
     The bias of a smooth loss f at an image of N samples is c / N + O(1 / N²). Let the image I_i have the share s_i of
     the N samples. The bias of f(I_i) is then c / (s_i N) to first order. For two images, the terms c / N therefore

@@ -1,7 +1,7 @@
-"""Image of a view and its derivatives with respect to every entry of the variables, from forward passes.
+"""Image of a view, and the derivatives of the image with respect to every entry of the variables.
 
-Image and derivatives are computed twice, from two independent halves of the samples. Each entry takes one forward pass
-per half. The forward pass uses the same random numbers as the image of its half.
+Image and derivatives are computed twice, from two independent halves of the samples. For each half, forward-mode
+differentiation renders one tangent image per entry, with the same random numbers as the image of this half.
 """
 
 from __future__ import annotations
@@ -138,7 +138,8 @@ class Jacobians:
     def _pass(self, key: str, view: int, request: RenderRequest) -> Array:
         """Render the image, or its derivative along the tangent of a variable.
 
-        If passes are recorded, each call except the first for a key and a view uses a recorded pass.
+        If passes are recorded, the first call for a pair of key and view is not recorded. Later calls use a recorded
+        pass.
         """
         scene, integrator, run = self.problem.scene, self.integrator, _image if key == IMAGE else _tangent
         state = integrator.begin(scene)

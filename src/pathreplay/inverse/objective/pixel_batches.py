@@ -26,7 +26,7 @@ class Batch:
 
     @staticmethod
     def of(weight: Array | None, size: tuple[int, int], most: int, seed: int) -> Batch | None:
-        """Draw ``most`` random pixels of an image of ``size`` (height, width); None if it has at most ``most``."""
+        """Draw ``most`` random pixels of an image of ``size`` (height, width); None if the image has no more pixels."""
         height, width = size
         n = height * width
         if most >= n:
@@ -45,9 +45,9 @@ class Batch:
 
 
 def obstacle(problem: Problem, integrator: StatefulIntegrator, sensor: int, spp: int, some: bool) -> str:
-    """Return why a single pass cannot compute both image and gradient of a view, or "" if it can.
+    """Return the reason why one pass cannot compute both image and gradient of a view, or "" if one pass suffices.
 
-    ``some`` selects a pass over a batch of pixels instead of all pixels.
+    With ``some``, the pass renders a batch of pixels. Otherwise it renders all pixels.
     """
     if problem.loss not in QUADRATIC:
         return "its loss is none of l2, relative-l2 and display-l2; use one of these"

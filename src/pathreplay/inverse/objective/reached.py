@@ -1,4 +1,4 @@
-"""Checks before the first iteration that the variables of each stage affect at least one of its views."""
+"""Checks that the variables of each stage affect a view of this stage. The checks precede the first iteration."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def require_possible(problem: Problem) -> None:
 def require_reached(problem: Problem) -> None:
     """Raise PathreplayError if the variables of a stage affect no view of the stage.
 
-    A job without stages counts as one stage. The integrator must also differentiate the variables.
+    A job without stages counts as one stage. Also raises PathreplayError if the integrator does not differentiate the
+    variables.
     """
     for part in parts_of(problem):
         where = f"stages: stage {part.number + 1}: " if part.stage else ""
@@ -49,7 +50,7 @@ def require_reached(problem: Problem) -> None:
 
 
 def _require_differentiated(part: Part, sensor: int, where: str) -> None:
-    """Raise PathreplayError if the integrator, or the one of the baseline run, treats the variables as constants."""
+    """Raise PathreplayError if the integrator of the run or of the baseline run cannot differentiate the variables."""
     problem = part.problem
     variables = variables_of(problem, {v.key: v.start for v in problem.variables})
     dr.enable_grad({key: value for key, value in variables.items() if key in part.moving})

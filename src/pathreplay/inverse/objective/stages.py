@@ -101,7 +101,11 @@ def _moving(problem: Problem, stage: Stage) -> list[str]:
 
 
 def require_stages(problem: Problem) -> None:
-    """Raise PathreplayError unless films and integrators suit all stages and each variable is optimised in a stage."""
+    """Check the stages of a job.
+
+    Raises PathreplayError if a stage cannot downscale a film, if an integrator does not support the ``max_depth`` of a
+    stage, or if no stage optimises a variable.
+    """
     config = problem.config
     for number, stage in enumerate(config.stages or []):
         part = _part(problem, number, stage)

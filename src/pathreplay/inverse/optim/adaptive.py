@@ -105,7 +105,7 @@ class DrJitOptimiser:
         return self._parts[self._is_uniform(key)]
 
     def _pieces(self, key: str) -> dict[str, slice]:
-        """Return the slices of the pieces of a variable. Their keys name the pieces in Dr.Jit's optimiser.
+        """Return the slices of the pieces of a variable, by the names of the pieces in Dr.Jit's optimiser.
 
         A variable of UniformAdam is a single piece.
         """

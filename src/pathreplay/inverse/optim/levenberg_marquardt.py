@@ -125,7 +125,11 @@ class LevenbergMarquardt:
         self._count, self._far, self._restarts, self._first = 0, 0, 0, 0.0
 
     def observe(self, model: GaussNewton) -> None:
-        """Receive the model of the loss at the values that the next `step` gets, with variables in the same order."""
+        """Receive the Gauss-Newton model of the loss.
+
+        The next call of `step` must get the values at which the model was computed. The variables must have the same
+        order in the model and in these values.
+        """
         self._model = model
 
     def step(
@@ -160,7 +164,7 @@ class LevenbergMarquardt:
             self._begin_averaging(base.at + step, LEAST)
         elif (promise <= NEAR * usual and not lowered) or self._stalls == STALLED:
             self._begin_averaging(base.at, LEAST)
-        elif self._rejections == STALLED:  # the model is unreliable without damping
+        elif self._rejections == STALLED:  # after so many rejections, an undamped step would not be reliable
             self._begin_averaging(base.at, self._damping)
         else:
             step, self._predicted = self._solved(base, self._damping)
@@ -196,7 +200,8 @@ class LevenbergMarquardt:
         assert self._base is not None
         share = 2 / (self._count + 2)
         model = self._base.model.times(1 - share) + seen.model.times(share)
-        # Average the covariances. `GaussNewton.times` gives the covariance of the mean gradient instead.
+        # The covariance is the weighted mean of the covariances of single evaluations. In ``model``, however, `times`
+        # has scaled the covariances by the squared weights, which gives the covariance of the mean gradient.
         noise = self._base.model.noise * (1 - share) + seen.model.noise * share
         point = replace(seen, model=replace(model, noise=noise))
         step, promise = self._solved(point, self._damping)
@@ -273,7 +278,7 @@ class LevenbergMarquardt:
         return self._split(self._next if self._count else self._base.at)
 
     def state(self) -> State:
-        """See `Optimiser`; the state is the last accepted evaluation, and the numbers that control the steps."""
+        """See `Optimiser`. The state is the last accepted evaluation and the numbers that control the steps."""
         steps = dict.fromkeys(self._shapes, self._steps)
         if self._base is None:
             return State(steps, {})
@@ -320,7 +325,9 @@ class LevenbergMarquardt:
 
 
 def _positive(model: GaussNewton) -> Matrix:
-    """Return H with its eigenvalues clipped to an interval, which makes H positive.
+    """Return H with its eigenvalues clipped to an interval.
+
+    For the entries that move, the result is positive definite. For all other entries (see `_scale`), it is zero.
 
     The eigenvalues are relative to the matrix `GaussNewton.robust` (generalised eigenvalues). The lower limit is the
     relative noise of H, which is estimated from its diagonal. The upper limit is `LARGEST`, which bounds the effect of

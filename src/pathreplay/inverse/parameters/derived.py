@@ -3,8 +3,8 @@
     p = f(p₀, a, b, ...),      where p₀ is the value in the scene and a, b, ... are variables
 
 Examples are a mesh whose bending depends on two numbers, one colour for three materials, a camera on a turntable, or
-a texture that a neural network predicts. The function f is written in Dr.Jit, and derivatives propagate through it. It
-is a function of the user, or the built-in displacement of a mesh by height maps (`displace`).
+a texture that a neural network predicts. The function f is written in Dr.Jit, and derivatives propagate through f.
+Either the user provides f, or f is the built-in displacement of a mesh by height maps (`displace`).
 """
 
 from __future__ import annotations
@@ -82,11 +82,12 @@ def make_derived(
 ) -> tuple[Derived, ...]:
     """Make the derived parameters, and evaluate each of them once per resolution of its variables.
 
-    The true values of the parameters are not set here.
+    The caller sets the reference values of the parameters (``truth``) later.
 
     Raises:
-        PathreplayError: a variable does not exist, a function cannot be imported, fails, returns an invalid value or
-            does not depend on one of its variables, or a displacement does not fit its mesh or its height map.
+        PathreplayError: a variable does not exist, or a displacement does not fit its mesh or its height map. The error
+            is also raised if a function cannot be imported, fails, returns an invalid value, or does not depend on one
+            of its variables.
     """
     derived = []
     for key, entry in keys.items():
@@ -104,7 +105,7 @@ def make_derived(
 def _function(
     params: mi.SceneParameters, key: str, entry: Derivation, arguments: list[Variable], modules: Modules
 ) -> Imported:
-    """Return the function of a derived parameter: one of the user's, or a displacement."""
+    """Return the function of a derived parameter: a user function or a displacement."""
     if entry.displace is None:
         assert entry.function is not None  # `Derivation` requires a function or a displacement
         return modules.function("Derivation", entry.function, "values")
@@ -116,7 +117,7 @@ def _function(
 def _named(
     name: str, key: str, keys: Mapping[str, Derivation], params: mi.SceneParameters, variables: list[Variable]
 ) -> Variable:
-    """Return the variable with a name. Raises PathreplayError if no variable has this name."""
+    """Return the variable with the key ``name``. Raises PathreplayError if there is no such variable."""
     known = {v.key: v for v in variables}
     if name in known:
         return known[name]
@@ -131,7 +132,7 @@ def _named(
 
 
 def _at_level(variable: Variable, k: int) -> Array:
-    """Resample the initial value of a variable to its k-th resolution, or to its last if it has fewer resolutions."""
+    """Resample the initial value of a variable to its k-th resolution, or to the last one if there are fewer."""
     if variable.levels is None:
         return variable.start
     return resampled(variable.start, variable.levels.shapes[min(k, len(variable.levels.shapes) - 1)])

@@ -24,7 +24,7 @@ from pathreplay.scenes.parameters import get_array
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Function of the positions p₀ and a height map that returns displaced positions, flat with 3 n floats.
+    """Displacement of n vertices by one height map. A call returns the displaced positions as 3 n floats.
 
     Vertices with equal positions p₀ have the same direction and move by the mean of their displacements. A watertight
     mesh therefore stays watertight, although files duplicate vertices at creases and seams of texture coordinates.
@@ -64,7 +64,7 @@ class HeightMap:
 
 @dataclass(frozen=True)
 class HeightMaps:
-    """Function of the positions p₀ and height maps that returns the sum of the displacements by all of them."""
+    """Displacement of vertices by several height maps. A call returns the positions displaced by all height maps."""
 
     maps: tuple[HeightMap, ...]
 
@@ -119,7 +119,7 @@ def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> 
 
 
 def require_map(key: str, name: str, shape: tuple[int, ...]) -> None:
-    """Raise PathreplayError unless the variable ``name``, by which ``key`` is displaced, has the shape of a map."""
+    """Raise PathreplayError unless the variable ``name``, which displaces ``key``, has the shape of a height map."""
     if len(shape) != 3 or shape[2] != 1:
         raise PathreplayError(
             f"Parameter '{key}' is displaced by '{name}' of shape {list(shape)}; give a height map of shape [rows, "
@@ -130,12 +130,14 @@ def require_map(key: str, name: str, shape: tuple[int, ...]) -> None:
 def _normals(
     positions: NDArray[np.float64], corners: NDArray[np.integer], faces: NDArray[np.integer], count: int
 ) -> NDArray[np.float64]:
-    """Return the unit normal at each of ``count`` distinct positions: the mean over its faces, weighted by angle.
+    """Return the unit normal at each of ``count`` distinct positions.
+
+    The normal at a position is the mean of the normals of the adjacent faces, weighted by the angles of the faces.
 
     Args:
         positions: positions of all vertices.
-        corners: indices of the distinct positions of each face.
-        faces: indices of the vertices of each face.
+        corners: for each face, the indices of the distinct positions of its three corners.
+        faces: for each face, the indices of its three vertices.
         count: number of distinct positions.
     """
     points = positions[faces]
@@ -151,7 +153,11 @@ def _normals(
 
 
 def _factors(params: mi.SceneParameters, key: str, owner: str, name: str | None, count: int) -> NDArray[np.floating]:
-    """Return the factor of each of the ``count`` vertices. Raises PathreplayError if the attribute does not fit."""
+    """Return the factor on the displacement of each of the ``count`` vertices, from the vertex attribute ``name``.
+
+    If ``name`` is None, all factors are 1. Raises PathreplayError if the mesh lacks the attribute, or if the attribute
+    does not have one number per vertex or is zero at all vertices.
+    """
     if name is None:
         return np.ones(count)
     if f"{owner}.{name}" not in params:
@@ -179,7 +185,9 @@ def _coordinates(
 ) -> NDArray[np.float32]:
     """Return (u, v) of all vertices as two rows.
 
-    Raises PathreplayError if the mesh lacks texture coordinates, or has no extent along an axis of planar coordinates.
+    The coordinates are texture coordinates if ``kind`` is 'uv'. Otherwise ``kind`` names two axes, and the coordinates
+    are the positions along these axes, scaled to [0, 1]. Raises PathreplayError if the mesh lacks texture coordinates,
+    or has no extent along one of the axes.
     """
     if kind == "uv":
         known = compat.texcoords_of(params, key)

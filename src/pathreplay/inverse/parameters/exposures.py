@@ -25,11 +25,11 @@ EXPOSURE = "exposure"
 
 
 class Factors:
-    """Logarithmic coordinates (`Coordinates`) of the factors, with a fixed common scale.
+    """Logarithmic coordinates (`Coordinates`) of the factors. The common scale of the factors can be fixed.
 
     The argument ``fixed`` contains indices of views. After each step, the mean logarithm of the factors of these views
-    is subtracted for each colour, which keeps the geometric mean of these factors at 1. If ``fixed`` is empty, nothing
-    is subtracted and the common scale is free.
+    is subtracted from all logarithms, separately for each colour. The geometric mean of these views' factors therefore
+    stays 1. If ``fixed`` is empty, nothing is subtracted and the common scale is free.
     """
 
     uniform = False
@@ -63,7 +63,10 @@ def start(views: int, channels: int, white_balance: bool) -> Array:
 
 
 def factor_of(values: Arrays, view: int, channels: int) -> Image | None:
-    """Return the factors (1, 1, channels) on the image of a view, with 1 for alpha, or None without exposures."""
+    """Return the factors on the channels of a view's image, shape (1, 1, channels). The factor on alpha is 1.
+
+    Returns None if ``values`` contain no exposures.
+    """
     if EXPOSURE not in values:
         return None
     row = values[EXPOSURE][view]
@@ -101,7 +104,7 @@ def derivative(
 
 
 def gradient(values: Arrays, view: int, by_log: Array) -> Array:
-    """Convert the result of `derivative` for one view to a gradient with respect to the whole variable."""
+    """Convert the result of `derivative` for one view to a gradient with respect to the factors of all views."""
     rows = values[EXPOSURE]
     by_factors = np.zeros_like(rows)
     colours = by_log[: len(by_log) - (len(by_log) in (2, 4))]
@@ -110,7 +113,7 @@ def gradient(values: Arrays, view: int, by_log: Array) -> Array:
 
 
 def derivatives_by_factors(values: Arrays, view: int, picture: Image) -> Array:
-    """Return the derivative of the exposed image of a view with respect to each entry of the variable."""
+    """Return the derivatives of a view's image, times its factor, with respect to each factor of all views."""
     rows = values[EXPOSURE]
     found = np.zeros((*rows.shape, *picture.shape), np.float32)
     colours = picture.shape[2] - (picture.shape[2] in (2, 4))
@@ -146,7 +149,8 @@ def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Imag
 def fixed_rows(names: Iterable[str], trained: Iterable[int], reference: str | None, free: bool) -> list[int]:
     """Return the indices of the views whose mean factor is fixed, for the argument ``fixed`` of `Factors`.
 
-    These are the reference view if there is one, or else all training views. The list is empty if ``free``.
+    If there is a reference view, the list contains only this view. Otherwise it contains all training views. If
+    ``free`` is set, the list is empty.
     """
     if free:
         return []

@@ -6,8 +6,8 @@ Gauss-Newton matrix H = JᵀWJ. Two halves a and b of the samples estimate all t
     ½ r_aᵀ W r_b,      g = ½ (J_aᵀ W r_b + J_bᵀ W r_a),      H = ½ (J_aᵀ W J_b + J_bᵀ W J_a).
 
 Products within one half would be biased by the variance of I, the covariance of J and I, and the variance of J,
-respectively. This bias cancels in the difference of the halves. The covariance of ½ (J_aᵀ W r_a - J_bᵀ W r_b) therefore
-equals the covariance of g, up to terms of second order in the noise.
+respectively. The halves have equal biases, which cancel in the difference of the halves. The covariance of
+½ (J_aᵀ W r_a - J_bᵀ W r_b) therefore equals the covariance of g, up to terms of second order in the noise.
 """
 
 from __future__ import annotations
@@ -134,11 +134,12 @@ def model_of(a: Half, b: Half, weight: Image, sizes: dict[str, int]) -> tuple[fl
     Args:
         a: one half.
         b: the other half, with independent samples.
-        weight: W, height x width x channels.
+        weight: the weights W, shape (height, width, channels).
         sizes: number of entries of each variable, in the order of the Jacobians.
 
     Returns:
-        The loss of the mean of both images, the gradient, and the model.
+        The loss ½ rᵀWr of the mean of the two images, the gradient, and the model. The noise of the mean image
+        contributes `GaussNewton.excess` to the expected loss.
     """
     n = len(a.jacobian)
     matrix, robust, bias, noise = np.zeros((4, n, n))
@@ -165,7 +166,7 @@ def model_of(a: Half, b: Half, weight: Image, sizes: dict[str, int]) -> tuple[fl
 
 
 def _tiles(images: Matrix) -> Matrix:
-    """Sum n images over square tiles; returns n x tiles."""
+    """Sum n images over square tiles. The result has the shape (n, number of tiles)."""
     for axis in (1, 2):
         images = np.add.reduceat(images, range(0, images.shape[axis], TILE), axis=axis)
     return images.reshape(len(images), -1)

@@ -61,7 +61,7 @@ class Pose:
         """Compute the value of the scene parameter. Derivatives propagate to the variables.
 
         Args:
-            variables: ``mi.Vector3f`` of width 1 by key: translation in scene units, rotation vector in radians.
+            variables: translation (scene units) and rotation vector (radians) by key, as ``mi.Vector3f`` of width 1.
         """
         moves = {part: variables[name] for part, name in self.parts().items()}
         zero = mi.Vector3f(0)

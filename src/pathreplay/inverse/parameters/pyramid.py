@@ -4,12 +4,14 @@ Let u_j be the entries of level j, and U_j the interpolation from level j to the
 
     v = Σ_j U_j u_j,        so that        ∂/∂u_j = U_jᵀ ∂/∂v.
 
-An optimiser such as Adam normalises each entry by its own moments. On the levels of a pyramid, Adam changes low
-frequencies as fast as on a coarse grid, and with the low gradient noise of a coarse grid. Entries whose gradient is
-zero change along with their neighbours, through the coarse levels (Weier et al. 2025).
+An optimiser such as Adam normalises each entry by its own moments. If Adam steps the levels of a pyramid, the coarse
+levels change low frequencies as fast as a coarse grid would. The gradient noise of a coarse level is also as low as
+that of a coarse grid. Grid entries whose gradient is zero change along with their neighbours, because both depend on
+the coarse levels (Weier et al. 2025).
 
-A given v does not determine the levels. Before each step, v is assigned to the finest level, and all others are zero.
-The step depends on gradients only, and the levels are discarded after it.
+A given v does not determine the levels. Before each step, v is assigned to the finest level, and all other levels are
+set to zero. This choice does not matter, because the step depends on gradients only. The levels are discarded after the
+step.
 """
 
 from __future__ import annotations

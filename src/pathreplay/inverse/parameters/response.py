@@ -9,8 +9,8 @@ Two forms of g are supported, both with g(0) = 0 and g(1) = 1:
     gamma    g(T) = T^γ
     curve    g(T) = s⁻¹(y(s(T))), where s is the sRGB encoding, and y is monotone and linear between its knots
 
-The derivative with respect to g is taken at fixed weights. A relative loss divides by the target, so without fixed
-weights, a curve g that brightens the target would reduce the loss.
+A relative loss divides by the target g(T). If the derivative with respect to g included this divisor, a curve g that
+brightens the target would reduce the loss. The divisor is therefore treated as a constant.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Increments:
         rises, found = np.diff(values.astype(np.float64)), np.zeros(len(values) - 1)
         for (a, b), (low, high) in self._spans():
             above = np.cumsum(by_values[a + 1 : b][::-1].astype(np.float64))[::-1]
-            slope = np.append(above, 0.0)  # derivative with respect to each difference between two fixed knots
+            slope = np.append(above, 0.0)  # derivative with respect to each difference of neighbouring knots
             found[a:b] = rises[a:b] * (slope - (rises[a:b] * slope).sum() / (high - low))
         return found.astype(np.float32)
 
@@ -70,7 +70,10 @@ class Increments:
 
 
 def start(segments: int | None) -> Array:
-    """Return g of an sRGB camera, the identity: the knots of a curve, or an exponent of 1 if ``segments`` is None."""
+    """Return the identity, which is the curve g of an sRGB camera, as initial value.
+
+    The value contains the knots of a curve with ``segments`` segments, or the exponent 1 if ``segments`` is None.
+    """
     return np.ones(1, np.float32) if segments is None else np.linspace(0, 1, segments + 1, dtype=np.float32)
 
 

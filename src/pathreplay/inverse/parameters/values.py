@@ -112,7 +112,7 @@ def adapted_image(name: str, image: Image, other: str, channels: int) -> Image:
     Args:
         name: name of the image in error messages.
         image: the image.
-        other: subject and verb of the clause that names the required channels, as in "sensor 'a' renders".
+        other: words before the required number of channels in the error message, such as "sensor 'a' renders".
         channels: required number of channels.
 
     Raises:

@@ -136,7 +136,7 @@ def make_variables(
     starts: Mapping[str, Array] = MappingProxyType({}),
     limit_rates: bool = True,
 ) -> tuple[list[Variable], list[Pose]]:
-    """Make the variables and poses of a job. Their true values are not set here.
+    """Make the variables and poses of a job. The caller sets their reference values (``truth``) later.
 
     Args:
         scene: the scene.
@@ -144,7 +144,7 @@ def make_variables(
         keys: tables of the parameters, by key (see `Config.completed_entry`).
         base: folder that relative paths start from.
         modules: finder of user functions.
-        starts: initial values by the key of a table, in place of its ``initial``.
+        starts: initial values, by the ``key`` of a table. They replace the ``initial`` of this table.
         limit_rates: whether to refuse learning rates that are large for the range of values. Rates of SGD cannot be
             checked, because the length of its steps is proportional to the gradient.
 
@@ -185,8 +185,8 @@ def make_variables(
         for part, name in pose.parts().items():
             start = np.array(getattr(entry.displacement, part) or [0.0, 0.0, 0.0], np.float32)
             if part == "rotation":
-                # Rotations are in degrees in the job and in radians here. ``learning_rate`` is in radians: points at a
-                # distance of 1 from the pivot then rotate as fast as translations move them.
+                # Rotations are in degrees in the job and in radians here. ``learning_rate`` is in radians. A rotation
+                # then moves points at a distance of 1 from the pivot as fast as a translation does.
                 start = np.radians(start)
                 degrees = entry.rotation_learning_rate
                 rate = rate if degrees is None else float(np.radians(degrees))

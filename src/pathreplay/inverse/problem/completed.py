@@ -20,8 +20,8 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
     """Fill in the integrators that a job leaves out.
 
     The default integrator of a job is `pathreplay` with the options of the scene's integrator. The default integrator
-    of rendered targets is `path`, or `volpath` for scenes with media. Its path limits (`Limits`) are copied from the
-    job's integrator.
+    of rendered targets is `path`, or `volpath` for scenes with media. The path limits (`Limits`) of this default are
+    copied from the job's integrator.
 
     Args:
         config: the job.

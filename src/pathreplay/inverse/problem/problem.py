@@ -65,7 +65,7 @@ from pathreplay.scenes.parameters import SceneValue
 
 
 class VariableCache:
-    """Cache of the last values that were converted to Dr.Jit, so that only one copy exists."""
+    """Cache of the variables that were last converted to Dr.Jit. All callers share this one copy."""
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[weakref.ref[Array], dr.ArrayBase]] = {}
@@ -305,7 +305,8 @@ def build_problem(
     variables = tuple(_kept(disk, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in unsolved_poses)
     derived = tuple(replace(entry, truth=truth.get(entry.key)) for entry in derived)
-    # Traverse again: update() would require all keys that were read from the old `params`, and some are removed here.
+    # `update` requires that all keys that were read from `params` still exist, but `keep_only` removes some of them.
+    # Traverse the scene again: no key of the new `params` has been read.
     params = traversed(scene)
     parameters.keep_only(params, keys)
     digest = fingerprint(used.values()) if used else None
@@ -333,7 +334,7 @@ def _loaded(
 
 @dataclass(frozen=True)
 class _Opened:
-    """The scene of a job, the parameters that it recovers, and its sensors by view."""
+    """The scene of a job, the parameters that the job recovers, and the index of the sensor of each view."""
 
     scene: mi.Scene
     params: mi.SceneParameters
@@ -437,8 +438,8 @@ def _require_gradients(integrator: mi.Integrator, name: str) -> None:
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
     """Return a note for the user if visibility boundaries move with the parameters.
 
-    The note says that boundary terms are expensive, or that the gradient lacks them. It replaces the integrator's own
-    note, which is suppressed.
+    The note says that boundary terms are expensive, or that the gradient lacks them. The integrator would log a note of
+    its own during rendering. That note is suppressed.
     """
     moving = [key for key in keys if moves_edges(params, key)]
     known = stateful(integrator)

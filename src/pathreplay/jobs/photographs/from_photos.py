@@ -73,7 +73,8 @@ def from_photos(
         mesh: PLY or OBJ file of the scene's geometry in the coordinates of the capture. Default: a density grid.
         minutes: time limit of the run on this machine, from which the number of iterations follows.
         test_every: the first photo and every n-th photo after it are test views.
-        width: width of the compared images in pixels, rounded to a multiple of 8; default: about 46 000 pixels.
+        width: width in pixels to which the photographs are resampled, rounded to a multiple of 8. By default, the
+            resampled photographs have about 46 000 pixels each.
         refine_poses: also optimise the poses of the photographs.
         tell: receives lines about the progress.
 
@@ -162,7 +163,7 @@ def _write(folder: Path, files: dict[str, bytes]) -> None:
 
 
 def _write_start(folder: Path, region: Box, mean: np.ndarray, proxy: Proxy | None) -> None:
-    """Write the initial values: a faint medium in the mean colour, or a grey mesh; and a sky in the mean colour."""
+    """Write the initial values: a sky in the mean colour, and a faint medium in the mean colour or a grey mesh."""
     start = folder / "start"
     start.mkdir()
     sky = np.broadcast_to(mean, (*SKY_SIZE, 3)).astype(np.float32)

@@ -15,7 +15,7 @@ SKY_SIZE = (16, 32)
 
 @dataclass(frozen=True)
 class Choices:
-    """What a job recovers besides the scene."""
+    """Choices about a job: whether it recovers a sky and refines poses, near clipping distance, and bounds."""
 
     has_sky: bool
     refine_poses: bool

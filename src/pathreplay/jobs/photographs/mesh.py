@@ -1,4 +1,4 @@
-"""A given mesh as the geometry of a capture."""
+"""Reads the mesh that the user gives as the geometry of a photographed scene, and writes it for a job."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class Proxy:
 
     @property
     def kind(self) -> str:
-        """The plugin that reads the stored file."""
+        """The Mitsuba plugin that reads the stored mesh file."""
         return self.path.suffix.lower()[1:] if self.textured else "ply"
 
     @property
     def stored(self) -> str:
-        """The file in the folder of the job."""
+        """Path of the mesh file, relative to the folder of the job."""
         return f"start/mesh.{self.kind}"
 
     @property

@@ -1,4 +1,4 @@
-"""Prepares photos: resamples them to pinhole cameras with square pixels, at the size that a job compares."""
+"""Prepares photos for a job: resamples them to pinhole cameras with square pixels and to the size of the targets."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def frames_of(photos: Sequence[Photo], width: int | None) -> list[Frame]:
         wanted = math.sqrt(PIXELS * lens.w / lens.h) if width is None else width
         columns = max(BLOCK, round(min(wanted, lens.w) / BLOCK) * BLOCK)
         scale = columns / lens.w
-        high = lens.h * scale * lens.fx / lens.fy  # pixels become square
+        high = lens.h * scale * lens.fx / lens.fy  # height of the image after its pixels are made square
         rows = int(high + 1e-6) // BLOCK * BLOCK
         if rows < BLOCK:
             raise PathreplayError(

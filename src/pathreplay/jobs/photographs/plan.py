@@ -34,7 +34,7 @@ USED = 0.75
 
 @dataclass(frozen=True)
 class StagePlan:
-    """A stage: iterations, reduction of the images, resolution of grids, views per iteration, samples per pixel."""
+    """A stage: iterations, downscale factor, resolution of grids, views per iteration, and samples per pixel."""
 
     iterations: int
     downscale: int

@@ -31,7 +31,7 @@ class Found:
     """Names of images of the capture that do not exist, whose frames are left out."""
 
     def notes(self) -> list[str]:
-        """Return a line for the user if frames are left out."""
+        """Return a list with a line for the user if photos are left out, because their image files do not exist."""
         if not self.missing:
             return []
         names = ", ".join(self.missing[:_NAMED]) + (", ..." if len(self.missing) > _NAMED else "")
