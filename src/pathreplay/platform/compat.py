@@ -105,7 +105,7 @@ def triangle_corners(
 def triangle_sides(
     hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Return the two sides of the triangle that was hit that start at its first corner.
+    """Return two sides of the triangle that was hit: the vectors from its first corner to the other two corners.
 
     The sides carry the same derivatives as the corners; see `triangle_corners`.
     """
@@ -193,7 +193,7 @@ def faces_of_positions(params: Mapping[str, object], key: str) -> NDArray[np.int
 
 
 def texcoords_of(params: Mapping[str, object], key: str) -> NDArray[np.float32]:
-    """Return the texture coordinates (n, 2) of a mesh, with shape (0, 2) if the mesh has none.
+    """Return the texture coordinates of a mesh as an array (n, 2), or (0, 2) if the mesh has none.
 
     ``key`` is the key of the positions of the mesh.
     """
@@ -214,7 +214,7 @@ def positions_like(positions: dr.ArrayBase, points: mi.Vector3f) -> dr.ArrayBase
 
 
 def is_mesh_data(name: str) -> bool:
-    """Return whether the mesh parameter ``name`` is stored in mesh files, such as positions or faces."""
+    """Return whether mesh files store the mesh parameter ``name``. They store, for example, positions and faces."""
     return name.startswith(_PREFIXES) or name in {*POSITIONS, *NORMALS, *TEXCOORDS, *_OTHERS}
 
 

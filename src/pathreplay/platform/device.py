@@ -1,9 +1,9 @@
 """The device that runs kernels: its local memory per lane, its total memory, and whether its sums are reproducible.
 
 On LLVM, each CPU thread runs one vector packet of lanes at a time, and local memory is part of the thread's stack. A
-GPU reserves local memory for every thread that can be resident, whatever the launch size. For example, 2048
-vertex records of 124 bytes per thread, for 2048 threads on each of 132 multiprocessors, take 69 GB. Long paths are
-therefore recorded only on CPUs.
+GPU reserves local memory for every thread that can be resident, whatever the launch size. For example, 2048 vertex
+records of 124 bytes per thread, for 2048 threads on each of 132 multiprocessors, take 69 GB. Long paths are therefore
+recorded only on CPUs.
 
 The limits for GPUs were measured on an H100 (docs/memory.md). Tests check the limits with simulated devices. On other
 GPUs, `pathreplay doctor --gpu` measures the limits.
@@ -112,7 +112,7 @@ def _cuda_device() -> Device:
 def available(variant: str) -> int:
     """Return the bytes available for rendering.
 
-    On a CPU, this is the free main memory. On a GPU, it is the minimum of free main memory and total GPU memory.
+    On a CPU, the result is the free main memory. On a GPU, it is the minimum of free main memory and total GPU memory.
     """
     device, left = device_of(variant), memory.available()
     return min(left, device.memory) if device.memory else left

@@ -24,7 +24,7 @@ _raised_at: list[float] = []  # time at which a signal handler last raised an ex
 def raise_once(error: BaseException) -> None:
     """Raise ``error``, unless this function raised an exception less than `ONE_WISH_S` seconds ago.
 
-    In this time the earlier exception may still be propagating, and ``error`` would replace it.
+    Within this time, the earlier exception may still be propagating, and ``error`` would replace it.
     """
     now = time.monotonic()
     if _raised_at and now - _raised_at[-1] < ONE_WISH_S:

@@ -73,7 +73,7 @@ class LivePictures:
 
     def is_due(self, seconds: float) -> bool:
         """Return whether images are due after an iteration that took ``seconds``."""
-        # Before the first images, the time to render them is unknown. The time of an iteration serves as a bound.
+        # Before the first images, their rendering time is unknown. The time of an iteration serves as an estimate.
         allowed = self.share * (time.perf_counter() - self._began)
         return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
 
