@@ -22,7 +22,7 @@ Content: TypeAlias = "bytes | Callable[[], Iterable[Chunk]]"
 
 
 def chunks(content: Content) -> Iterable[Chunk]:
-    """The content of a file in chunks."""
+    """Return the content of a file in chunks."""
     return (content,) if isinstance(content, bytes) else content()
 
 
@@ -84,7 +84,7 @@ def whole_folder(path: Path, option: str) -> Iterator[Path]:
         yield part
         with undisturbed():
             part.chmod(0o777 & ~_umask())
-            os.replace(part, path)  # also replaces an empty folder
+            os.replace(part, path)  # this call also replaces an empty folder at ``path``
     except BaseException as error:
         if part is not None:
             shutil.rmtree(part, ignore_errors=True)
@@ -94,9 +94,10 @@ def whole_folder(path: Path, option: str) -> Iterator[Path]:
 
 
 def _umask() -> int:
-    """Return the umask of this process, from which callers compute the usual permissions of a new file or folder.
+    """Return the umask of this process.
 
-    Temporary files are created without permissions for other users.
+    Temporary files and folders are created without permissions for other users. Before the final renaming, callers use
+    the umask to set the permissions that a new file or folder usually has.
     """
     mask = os.umask(0)
     os.umask(mask)

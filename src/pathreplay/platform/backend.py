@@ -26,8 +26,8 @@ def point_drjit() -> None:
     """Make Dr.Jit load a working libLLVM, without testing it. Raises nothing.
 
     If drjit is not imported yet, DRJIT_LIBLLVM_PATH is set to the libLLVM of the wheel karellen-llvm-core, or else to
-    the newest system library that is not known to fail. A previous value that names a loadable library is kept. If
-    drjit is already imported, a loaded library that is known to fail is replaced.
+    the newest system library that is not known to fail. If the variable already names a loadable library, its value
+    is kept. If drjit is already imported and has loaded a library that is known to fail, that library is replaced.
     """
     if "drjit" in sys.modules:
         path = None if loaded_is_plausible() else _untried_choice()
@@ -73,7 +73,7 @@ def _preload(paths: list[str]) -> str:
 
 
 def loaded_version() -> tuple[int, ...]:
-    """Version of the libLLVM that Dr.Jit has loaded, e.g. (23, 1, 4); empty if the LLVM back end is inactive."""
+    """Return the version of the loaded libLLVM, e.g. (23, 1, 4). It is empty if the LLVM back end is inactive."""
     import drjit as dr
 
     return tuple(dr.detail.llvm_version()) if dr.has_backend(dr.JitBackend.LLVM) else ()
@@ -116,7 +116,7 @@ def reload_llvm(path: str) -> bool:
 
 
 def warn_of_bad_llvm() -> None:
-    """Log a warning if this process has loaded a libLLVM that aborts it; called when an LLVM variant is set."""
+    """Log a warning if Dr.Jit has loaded a libLLVM that aborts the process. Called when an LLVM variant is set."""
     if not loaded_is_plausible():
         logger.warning(
             "Dr.Jit has loaded libLLVM %s, which aborts the process at the first minimum or maximum: %s",

@@ -7,8 +7,8 @@ and ignore its version number.
   only, and tangents are not part of ``Minimal``.
 - Meshes: 3.9 has flat arrays such as ``vertex_positions``; 3.10 has tensors such as ``positions``, with one row per
   point. In 3.10, vertices can refer to positions and normals through index maps, which are empty by default.
-- Silhouettes: 3.10 prepares them lazily, for meshes whose positions have gradients. This has no effect, because
-  pathreplay does not sample Mitsuba's silhouettes.
+- Silhouettes: 3.10 prepares silhouettes lazily, for meshes whose positions have gradients. The difference is without
+  effect, because pathreplay does not sample Mitsuba's silhouettes.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ NORMALS = "vertex_normals", "normals"
 TEXCOORDS = "vertex_texcoords", "texcoords"
 _FACES = "faces"
 _SHADING = "Default"  # a flag that only 3.10 has
-_FROM_FIELDS = "from_fields"  # a method that only 3.10 has, and that fills a mesh
+_FROM_FIELDS = "from_fields"  # a method of meshes in 3.10, which sets faces, positions and other data
 _PREFIXES = "vertex_", "face_"
-_SPACE = 64  # number of entries that are allocated after the values of an array
+_SPACE = 64  # number of unused entries that are allocated after the values of an array
 _OTHERS = _FACES, "bsdf_index", "position_index", "normal_index"
 
 
 class _Detail(NamedTuple):
-    """Values of the flags of `compute_surface_interaction`, by the names of the functions below."""
+    """Combinations of flags for `compute_surface_interaction`, one for each function of the same name below."""
 
     minimal: int
     shading_frame: int
@@ -47,7 +47,7 @@ class _Detail(NamedTuple):
 
 @cache
 def _detail(flags: type[enum.Enum]) -> _Detail:
-    """Return the values of the flags. ``flags`` is the enumeration `mi.RayFlags` of the active variant."""
+    """Return the combinations of flags. ``flags`` is the enumeration `mi.RayFlags` of the active variant."""
     value = {name: int(flag.value) for name, flag in flags.__members__.items()}
     minimal, follow = value["Minimal"], value["FollowShape"]
     if _SHADING in value:
@@ -82,14 +82,17 @@ def normal_partials() -> int:
 
 
 def follow_shape() -> int:
-    """Flag of an interaction that is differentiated at fixed surface coordinates, so that it follows the shape."""
+    """Flag of an interaction that follows the shape: its derivatives are taken at fixed surface coordinates."""
     return _detail(mi.RayFlags).follow_shape
 
 
 def triangle_corners(
     hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.Point3f, mi.Point3f, mi.Point3f]:
-    """Return the corners of the triangle that was hit. They move with the mesh, and with its instance."""
+    """Return the corners of the triangle that was hit.
+
+    The corners carry the derivatives of the mesh and of the instance that contains the mesh.
+    """
     points = []
     for uv in ((0, 0), (1, 0), (0, 1)):
         corner = mi.PreliminaryIntersection3f(hit)
@@ -102,12 +105,15 @@ def triangle_corners(
 def triangle_sides(
     hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Return two sides of the triangle that was hit, from its first corner. They move with the mesh."""
+    """Return two sides of the triangle that was hit: the vectors from its first corner to the other two corners.
+
+    The sides carry the same derivatives as the corners; see `triangle_corners`.
+    """
     if _SHADING in mi.RayFlags.__members__:
         a, b, c = triangle_corners(hit, ray, active)
         return b - a, c - a
     si = hit.compute_surface_interaction(ray, minimal() | follow_shape(), active)
-    return si.dp_du, si.dp_dv  # the tangents are the sides if texture coordinates are not requested
+    return si.dp_du, si.dp_dv  # both are sides of the triangle, because the flags request no texture coordinates
 
 
 class MeshArrays(NamedTuple):
@@ -171,7 +177,7 @@ def _has_mesh_tensors() -> bool:
 
 
 def is_positions(key: str) -> bool:
-    """Return whether a key is the name of the positions of a mesh."""
+    """Return whether a parameter with this key consists of the positions of a mesh."""
     return key.rpartition(".")[2] in POSITIONS
 
 
@@ -187,25 +193,28 @@ def faces_of_positions(params: Mapping[str, object], key: str) -> NDArray[np.int
 
 
 def texcoords_of(params: Mapping[str, object], key: str) -> NDArray[np.float32]:
-    """Return the texture coordinates (n, 2) of the mesh with the positions ``key``; (0, 2) if it has none."""
+    """Return the texture coordinates of a mesh as an array (n, 2), or (0, 2) if the mesh has none.
+
+    ``key`` is the key of the positions of the mesh.
+    """
     owner, dot, _ = key.rpartition(".")
     first, second = (f"{owner}{dot}{name}" for name in TEXCOORDS)
     return _rows(params, (first, second), 2)
 
 
 def points_of(positions: dr.ArrayBase) -> mi.Vector3f:
-    """Return positions of a mesh as points."""
+    """Convert ``positions``, the parameter of a mesh, to an array of 3D points."""
     return dr.unravel(mi.Vector3f, positions.array if dr.is_tensor_v(positions) else positions)
 
 
 def positions_like(positions: dr.ArrayBase, points: mi.Vector3f) -> dr.ArrayBase:
-    """Convert points to the type and shape of ``positions``, which are positions of a mesh."""
+    """Convert 3D points to the type and shape of ``positions``, the parameter of a mesh."""
     flat: mi.Float = dr.ravel(points)
     return mi.TensorXf(flat, shape=positions.shape) if dr.is_tensor_v(positions) else flat
 
 
 def is_mesh_data(name: str) -> bool:
-    """Return whether a parameter of a mesh, ``name``, is part of the mesh file."""
+    """Return whether mesh files store the mesh parameter ``name``. They store, for example, positions and faces."""
     return name.startswith(_PREFIXES) or name in {*POSITIONS, *NORMALS, *TEXCOORDS, *_OTHERS}
 
 
@@ -218,8 +227,8 @@ def has_normals(mesh: mi.Mesh) -> bool:
 def _with_space(values: NDArray[np.generic]) -> NDArray[np.generic]:
     """Copy the values into a larger allocation.
 
-    Dr.Jit uses the memory of a NumPy array in place. On LLVM, it reads whole packets, which may extend beyond the end
-    of the array. This crashes the process if the array ends at the end of a memory page.
+    Dr.Jit uses the memory of a NumPy array in place. On LLVM, Dr.Jit reads whole packets, which may extend beyond the
+    end of the array. If the array ends at the end of a memory page, such a read crashes the process.
     """
     result = np.zeros(values.size + _SPACE, values.dtype)
     result[: values.size] = values

@@ -1,9 +1,9 @@
-"""The device that runs kernels: its local memory per lane, its total memory, and the order of its additions.
+"""The device that runs kernels: its local memory per lane, its total memory, and whether its sums are reproducible.
 
-On LLVM, the lanes of one vector packet per thread run at the same time, and local memory is part of each thread's
-stack. A GPU reserves local memory for every thread that can be resident, whatever the launch size. For example, 2048
-vertex records of 124 bytes per thread, for 2048 threads on each of 132 multiprocessors, take 69 GB. Long paths are
-therefore recorded only on CPUs.
+On LLVM, each CPU thread runs one vector packet of lanes at a time, and local memory is part of the thread's stack. A
+GPU reserves local memory for every thread that can be resident, whatever the launch size. For example, 2048 vertex
+records of 124 bytes per thread, for 2048 threads on each of 132 multiprocessors, take 69 GB. Long paths are therefore
+recorded only on CPUs.
 
 The limits for GPUs were measured on an H100 (docs/memory.md). Tests check the limits with simulated devices. On other
 GPUs, `pathreplay doctor --gpu` measures the limits.
@@ -35,7 +35,7 @@ _MULTIPROCESSORS, _THREADS_EACH = 16, 39
 class Device:
     """The device that runs the kernels of a variant.
 
-    ``lanes`` is the number of lanes that hold local memory at once, and ``memory`` the device's own memory in bytes.
+    ``lanes`` is the number of lanes that hold local memory at once, and ``memory`` is the size of GPU memory in bytes.
     Both are 0 for CPUs, which are limited by stack and main memory instead.
     """
 
@@ -61,17 +61,23 @@ class Device:
         return min(LARGEST_LOCAL, int(SHARE * self.memory) // self.lanes) if known else LARGEST_LOCAL
 
     def most_records(self, size: int, otherwise: int) -> int:
-        """Return how many records of ``size`` bytes fit into the local memory of a lane, at most ``otherwise``."""
+        """Return the largest number of records of ``size`` bytes that a lane may have, which is at most ``otherwise``.
+
+        On a GPU, the records must also fit into the local memory of the lane.
+        """
         room = self.local_bytes()
         return otherwise if room is None else min(otherwise, room // size)
 
     def room(self, records: int) -> int:
-        """Return the number of records to allocate if ``records`` are needed: on a GPU at least `FEWEST_RECORDS`."""
+        """Return the number of records to allocate if ``records`` are needed.
+
+        On a GPU, the result is at least `FEWEST_RECORDS`.
+        """
         return max(records, FEWEST_RECORDS) if self.is_gpu else records
 
 
 def backend_of(variant: str) -> str:
-    """The back end of a variant, from its name."""
+    """Return the back end that is part of the name of a variant."""
     return variant.split("_")[0]
 
 
@@ -104,7 +110,10 @@ def _cuda_device() -> Device:
 
 
 def available(variant: str) -> int:
-    """Return the bytes available for rendering: the free main memory, and on a GPU at most the total GPU memory."""
+    """Return the bytes available for rendering.
+
+    On a CPU, the result is the free main memory. On a GPU, it is the minimum of free main memory and total GPU memory.
+    """
     device, left = device_of(variant), memory.available()
     return min(left, device.memory) if device.memory else left
 

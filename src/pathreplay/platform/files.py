@@ -42,8 +42,8 @@ def file_problem(path: str | Path, most_bytes: int | None = None) -> str:
     return ""
 
 
-# Largest number of bytes of a file name. File systems allow 255 bytes. The difference is reserved for a prefix, a
-# suffix, and the mark of an unfinished file.
+# Largest number of bytes of a file name here. File systems allow 255 bytes. The remaining bytes are reserved for a
+# prefix and suffixes.
 LONGEST = 150
 
 
@@ -54,7 +54,7 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
     of the name is appended to a file name that was truncated or would collide with another file name.
     """
     safe = {name: re.sub(r"[^\w.-]", "_", name) for name in names}
-    # Some file systems ignore case, hence casefold.
+    # Names are compared with `casefold`, because some file systems ignore case.
     met = Counter(text.casefold() for text in safe.values())
     for name, text in safe.items():
         cut = text.encode()[:LONGEST].decode(errors="ignore")

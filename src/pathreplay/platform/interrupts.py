@@ -24,7 +24,7 @@ _raised_at: list[float] = []  # time at which a signal handler last raised an ex
 def raise_once(error: BaseException) -> None:
     """Raise ``error``, unless this function raised an exception less than `ONE_WISH_S` seconds ago.
 
-    The earlier exception may still propagate.
+    Within this time, the earlier exception may still be propagating, and ``error`` would replace it.
     """
     now = time.monotonic()
     if _raised_at and now - _raised_at[-1] < ONE_WISH_S:
@@ -50,10 +50,10 @@ def name_of(number: int) -> str:
 def handled(
     handle: Callable[[int, FrameType | None], object], keep: Callable[[], bool] = lambda: False
 ) -> Iterator[None]:
-    """Handle the signals in `ENDING` by ``handle`` within this block, if this is the main thread.
+    """Call ``handle`` for each signal in `ENDING` within this block. Outside of the main thread, do nothing.
 
-    SIGTERM and SIGHUP stay ignored if the parent process ignores them (nohup). The previous handlers are restored at
-    the end, unless ``keep`` returns True because the process is about to exit.
+    If the parent process ignores SIGTERM or SIGHUP (nohup), this process also ignores the signal. The previous handlers
+    are restored at the end of the block, unless ``keep`` returns True because the process is about to exit.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can set handlers
@@ -75,7 +75,7 @@ def raised() -> Iterator[None]:
     """Make each signal raise `Interrupted` within this block.
 
     If a library converts this exception to another, the block still raises `Interrupted`. After a signal, the handlers
-    stay in place until the process ends, so that further signals cannot kill it.
+    stay in place until the process ends, so that further signals cannot kill the process.
     """
     numbers: list[int] = []
 
@@ -87,7 +87,7 @@ def raised() -> Iterator[None]:
         try:
             yield
         except (RuntimeError, ImportError, SystemError):
-            if numbers:  # Dr.Jit has converted `Interrupted`, raised while Dr.Jit was tracing
+            if numbers:  # Dr.Jit was tracing, and has replaced the `Interrupted` by this exception
                 raise Interrupted(numbers[0]) from None
             raise
 
@@ -142,6 +142,6 @@ def stopping(say: Callable[[str], None], remedy: str, stop: Stop | None = None) 
         try:
             yield stop
         except (RuntimeError, PathreplayError):
-            if stop.aborted:  # Dr.Jit has converted the KeyboardInterrupt, raised while Dr.Jit was tracing
+            if stop.aborted:  # Dr.Jit was tracing, and has replaced the KeyboardInterrupt by this exception
                 raise KeyboardInterrupt(remedy) from None
             raise

@@ -94,7 +94,7 @@ def version_in_path(path: str) -> tuple[int, ...]:
     """Return the LLVM version in a path as a tuple, which is empty if the path contains no version.
 
     Examples: libLLVM.so.19.1 -> (19, 1); libLLVM-15.so.1 -> (15,); .../llvm@20/20.1.8/lib/libLLVM.dylib -> (20, 1, 8).
-    A single digit after .so is the version of the interface, which differs from that of LLVM.
+    A single digit after .so is ignored: it is the version of the library's interface, not the version of LLVM.
     """
     name = os.path.basename(path)
     for text, pattern in (
@@ -119,7 +119,7 @@ def _known_to_linker() -> list[str]:
 
 
 def system_libraries() -> list[str]:
-    """The system's libLLVM files, from new to old, each file once."""
+    """Return the system's libLLVM files, from new to old, each file once."""
     paths = [path for pattern in _SYSTEM_PATTERNS.get(sys.platform, ()) for path in glob.glob(pattern)]
     files = {os.path.realpath(path) for path in _known_to_linker() + paths if os.path.isfile(path)}
     return sorted(files, key=lambda path: (version_in_path(path), path), reverse=True)
@@ -128,7 +128,7 @@ def system_libraries() -> list[str]:
 def candidates() -> Iterator[tuple[str, str]]:
     """Yield (path, origin) of each libLLVM to test, in order of preference, each file once."""
     pip = pip_library() or ""
-    # The parent process may have set the variable to the path of the wheel's library. The origin is then still pip.
+    # A parent process may have set DRJIT_LIBLLVM_PATH to the wheel's library. The origin of the library is then "pip".
     named = ((ASKED_FOR, "pip" if ASKED_FOR == pip else ENVIRONMENT_VARIABLE), (pip, "pip"))
     seen = {""}
     for path, origin in (*named, *((path, "system") for path in system_libraries())):
@@ -138,8 +138,8 @@ def candidates() -> Iterator[tuple[str, str]]:
             yield path, origin
 
 
-#: First lines of the code of every test. They set the parent's sys.path, disable core dumps (because a crash is a valid
-#: result), and load libraries.
+#: First lines of the code of every test. The lines copy sys.path from the parent process, disable core dumps (because a
+#: crash is a valid result), and load libraries.
 _BEGIN = """
 import ctypes, json, sys
 task = json.loads(sys.argv[1])

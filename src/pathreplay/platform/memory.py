@@ -11,7 +11,8 @@ import psutil
 
 from pathreplay.errors import PathreplayError
 
-# Limit, usage and statistics of a container, in versions 2 and 1 of Linux control groups.
+# Files with the memory limit, memory usage and memory statistics of a container. The first row is for version 2 of the
+# control groups of Linux, the second row for version 1.
 _CONTAINERS = tuple(
     tuple(Path("/sys/fs/cgroup", name) for name in names)
     for names in (
@@ -24,7 +25,7 @@ _CONTAINERS = tuple(
 def available() -> int:
     """Return the bytes that this process can allocate without swapping.
 
-    Limits are the free memory of the machine, the limit of the container, and the budget of `within`.
+    The result is limited by the free memory of the machine, the limit of the container, and the budget of `within`.
     """
     left = int(psutil.virtual_memory().available)
     for limit, used, statistics in _CONTAINERS:
@@ -32,7 +33,7 @@ def available() -> int:
             # The usage of a container includes cached files, but their memory is available: it is freed when needed.
             cached = dict(re.findall(r"^(?:total_)?((?:in)?active_file) (\d+)$", statistics.read_text(), re.MULTILINE))
             left = min(left, int(limit.read_text()) - int(used.read_text()) + sum(map(int, cached.values())))
-        except (OSError, ValueError):  # no such group, or 'max' (no limit)
+        except (OSError, ValueError):  # the file does not exist, or contains 'max' (no limit)
             continue
     if _budget is not None:
         left = min(left, _budget - taken())
@@ -45,7 +46,7 @@ _budget: int | None = None
 
 @contextmanager
 def within(budget: int | None) -> Iterator[None]:
-    """Set the memory budget of this process, in bytes, within this block; None: no budget.
+    """Set the memory budget of this process, in bytes, within this block. None sets no budget.
 
     `available` respects the budget, and `require_kept` enforces it.
     """
@@ -59,13 +60,16 @@ def within(budget: int | None) -> Iterator[None]:
 
 
 def taken() -> int:
-    """Return the bytes of memory private to this process, without file-backed pages, which can be read again."""
+    """Return the bytes of memory private to this process.
+
+    File-backed pages are not counted, because the system can drop them and read them again.
+    """
     info = psutil.Process().memory_info()
     return int(info.rss - getattr(info, "shared", 0))
 
 
 def is_crowded() -> bool:
-    """Whether more than half of a budget is used, so that caches should be dropped."""
+    """Return whether this process uses more than half of its budget, so that caches should be dropped."""
     return _budget is not None and taken() > _budget // 2
 
 

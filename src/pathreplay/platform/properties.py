@@ -1,4 +1,4 @@
-"""Declarations of plugin properties, from which plugins read their defaults and the reference of plugins is made."""
+"""Declarations of plugin properties, used for the defaults of plugins and for the reference pages of plugins."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Property(Generic[T]):
         name: name of the property in XML and in dictionaries.
         kind: type of the value, such as ``integer`` or ``texture``.
         default: default value. None means that the property has no default, or that ``meaning`` states the default.
-        meaning: what the property selects, as statements in Markdown.
+        meaning: description of the property in Markdown.
         choices: all valid values, if there are few.
-        see: page and heading below ``docs/`` that say more.
+        see: page below ``docs/`` with more details, and a heading on this page.
         differentiable: key of the parameter that carries gradients, or "".
     """
 

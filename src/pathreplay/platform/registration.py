@@ -1,9 +1,9 @@
 """Registers our plugins for the active variant of Mitsuba and for every variant set later.
 
 Mitsuba knows a Python plugin only in the variant in which the plugin was registered, and calls a variant callback only
-for variants set after the callback was added. Variants without derivatives, such as scalar ones, get stand-ins, which
-raise an error that names the variant to use. Polarised variants get the plugins, which report that polarisation is not
-supported.
+for variants set after the callback was added. In variants without derivatives, such as scalar ones, each plugin is
+replaced by a function that raises an error and names a variant to use. In polarised variants, the plugins are
+registered, and report that polarisation is not supported.
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ Plugins = Mapping[str, tuple[str, str, str]]
 
 
 def register(variant: str, plugins: Plugins = PLUGINS) -> None:
-    """Register ``plugins`` for the active ``variant``, or stand-ins if the variant has no derivatives."""
+    """Register ``plugins`` for the active ``variant``.
+
+    If the variant has no derivatives, functions that raise an error are registered instead.
+    """
     import mitsuba as mi
 
     if "_ad_" not in variant:
@@ -50,7 +53,7 @@ def register(variant: str, plugins: Plugins = PLUGINS) -> None:
 
 
 def mitsuba_integrator() -> Any:
-    """Return Mitsuba's ADIntegrator of the active variant, whose `prepare` seeds the sampler of each pass."""
+    """Return Mitsuba's class ADIntegrator for the active variant. Its method `prepare` seeds the sampler of a pass."""
     # Mitsuba executes the module `common` again for every variant. An import from the public `mitsuba.ad` would create
     # a copy of `common` that stays bound to the first variant.
     from mitsuba.python.ad.integrators.common import ADIntegrator
@@ -87,7 +90,7 @@ def _register_stand_ins(variant: str, plugins: Plugins) -> None:
 
 
 def install(plugins: Plugins = PLUGINS) -> None:
-    """Register ``plugins`` for the active variant, if any, and for each variant set later. Sets no variant."""
+    """Register ``plugins`` for the active variant, if any, and for each variant set later. Set no variant."""
     import mitsuba as mi
 
     mi.detail.add_variant_callback(lambda _old, new: register(new, plugins))

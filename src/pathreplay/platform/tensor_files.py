@@ -1,6 +1,6 @@
 """Writes safetensors files in chunks, without copying tensors, and with only one tensor in memory at a time.
 
-The library's own `save` needs memory for the whole file and for two copies of its tensors.
+The function `save` of the package safetensors needs memory for the whole file and for two copies of its tensors.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ def safetensors_chunks(
     Args:
         arrays: arrays by name; each is accessed twice (`WhenAsked` computes arrays on access).
         metadata: text fields of the header.
-        room: sizes in bytes, by name, of further tensors at the end of the file, which the caller writes.
+        room: further tensors at the end of the file, as sizes in bytes by name. The header describes these tensors, and
+            the caller writes their bytes.
 
     Raises:
         PathreplayError: an array has a data type that is not supported.

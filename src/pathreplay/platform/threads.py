@@ -1,4 +1,7 @@
-"""Changes the size of Dr.Jit's thread pool temporarily: two threads to read files, one for reproducible sums."""
+"""Changes the size of Dr.Jit's thread pool temporarily.
+
+Mitsuba needs at least two threads to read files. Sums are reproducible only with a single thread.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ def spare_thread() -> AbstractContextManager[None]:
 
     Mitsuba 3.9 submits the blocks of an EXR file to the pool, and the submitting thread only waits. A process that is
     restricted to a single core (`taskset -c 0`, small containers) has a pool of one thread, which would wait forever.
-    Writing has the same defect; `exr_bytes` writes without Mitsuba.
+    Mitsuba's EXR writer has the same defect, so `exr_bytes` writes EXR files without Mitsuba.
     """
     return _threads(max(2, dr.thread_count()))
 

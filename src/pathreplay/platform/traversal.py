@@ -21,7 +21,10 @@ def traversed(thing: mi.Object) -> mi.SceneParameters:
 
 
 def known_values(params: mi.SceneParameters) -> Iterator[tuple[str, Any]]:
-    """Yield keys and values other than None. Do not change the values: `params.update` would not notice a change."""
+    """Yield the keys and values of parameters that are not None.
+
+    Callers must not change the values in place, because `params.update` would not notice the change.
+    """
     for key, (value, kind, node, _) in params.properties.items():
         current = value if kind is None else params.get_property(value, kind, node)
         if current is not None:

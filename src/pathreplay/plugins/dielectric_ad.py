@@ -1,22 +1,23 @@
 """`dielectric_ad`: Mitsuba's `dielectric` with a differentiable index of refraction.
 
-Let η be the interior over the exterior index, θ_i and θ_t the angles of incidence and refraction, F(θ_i, η) the
-unpolarised Fresnel reflectance, and η_ti = 1/η (from outside) or η (from inside). The two lobes are
+Let η be the interior index divided by the exterior index, θ_i and θ_t the angles of incidence and refraction, and
+F(θ_i, η) the unpolarised Fresnel reflectance. Let η_ti be 1/η for rays from outside, and η for rays from inside. The
+two lobes are
 
     reflection      wo = (-wi_x, -wi_y, wi_z)                            f = F · specular_reflectance
     transmission    wo = (-η_ti wi_x, -η_ti wi_y, -sign(wi_z) cos θ_t)   f = (1 - F) · specular_transmittance · s
 
 where s = η_ti² in radiance mode and 1 in importance mode. BSDF flags, wo and f are the same as in Mitsuba's plugin. The
 probability of reflection is F, as in Mitsuba, with one exception. For rays from the denser side, below the critical
-angle, transmission is sampled with a probability of at least 1/4. Near the critical angle dF is unbounded, and samples
-with the small probability 1 - F would contribute nearly all of the derivative.
+angle, transmission is sampled with a probability of at least 1/4. Near the critical angle the derivative of F is
+unbounded, and samples with the small probability 1 - F would contribute nearly all of the derivative of the image.
 
 The direction wo and the weight are differentiated with respect to `eta` and si.wi. The weight is also differentiated
 with respect to the tints `specular_reflectance` and `specular_transmittance`. The probability of choosing a lobe and
-the onset of total internal reflection are *not* differentiated (F is continuous at the onset). bs.pdf is detached, and
-the weight is f / detach(pdf). If both lobes are enabled, the value of the weight is the tint (times s for
-transmission), while its derivative contains the Fresnel term. Where the minimum of 1/4 applies, because F exceeds 3/4,
-the value has an additional factor: F / (3/4) for reflection and (1 - F) / (1/4) for transmission. If an edge of the
+the critical angle are *not* differentiated (F is continuous at the critical angle). bs.pdf is detached, and the weight
+is f / detach(pdf). If both lobes are enabled, the value of the weight is the tint (times s for transmission), and the
+derivative of the weight contains the derivative of F. Where F exceeds 3/4, the minimum of 1/4 applies, and the value of
+the weight has an additional factor: F / (3/4) for reflection and (1 - F) / (1/4) for transmission. If an edge of the
 scene is visible through a lobe, the integrator has to add a boundary term for the motion of the edge.
 """
 
@@ -126,7 +127,7 @@ class DielectricAD:
         if not (has_r or has_t):
             return bs, mi.Spectrum(0)
 
-        # Fresnel reflectance, cos θ_t, and relative index along (η_it) and against (η_ti) the direction of travel
+        # F is the Fresnel reflectance, η_it the relative index in the direction of travel, and η_ti = 1 / η_it.
         F, cos_t, η_it, η_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.eta)
         # Under total internal reflection, F is 1 at all angles. The derivative that mi.fresnel returns there is a
         # rounding error divided by cos θ_i.
@@ -141,7 +142,8 @@ class DielectricAD:
         if has_r and has_t:
             bs.pdf = dr.select(selected_r, p_r, 1 - p_r)
             weight = f / bs.pdf
-            # If p_r is not clamped, f / pdf is 1 up to rounding, or 0 / 0 where the probability is zero: use 1.
+            # If p_r is not clamped, f / pdf is 1 up to rounding, or 0 / 0 where the probability is zero. The value of
+            # the weight is set to 1 in both cases.
             weight = dr.replace_grad(dr.select(p_r == F, 1, weight), weight)
         else:
             bs.pdf = mi.Float(1)

@@ -1,9 +1,9 @@
 """Cell-by-cell ray traversal: free flight with local majorants, transmittance with local control densities.
 
-The state of the traversal (Amanatides and Woo 1987) is the cell and the distance. The distance to the next cell face of
-axis k is computed from the cell, as t_k = (cell_k + [d_k > 0] - o_k) / d_k. The distance is not a sum of earlier steps,
-so that rounding errors do not grow. The traversal never returns to a cell that it has left, which bounds the number of
-steps.
+The state of the traversal (Amanatides and Woo 1987) is the current cell and the distance along the ray o + t d. The
+distance to the next cell face perpendicular to axis k is computed from the cell, as
+t_k = (cell_k + [d_k > 0] - o_k) / d_k. The distance is not a sum of earlier steps, so that rounding errors do not grow.
+The traversal never returns to a cell that it has left, which bounds the number of steps.
 
 Callers detach all inputs, except those of `through`. All functions can be used inside symbolic loops.
 """
@@ -43,7 +43,7 @@ class Cells:
 
     One layer of empty cells surrounds the grid, because rounding may move a ray one cell too far. This layer is
     included in ``shape``, the number of cells along x, y, z. ``to_cell`` (3 x 4) maps world space to cell space, where
-    the layer begins at 0. ``table`` (Float, flat) contains the same number of values per cell, with x varying fastest.
+    the layer begins at 0. ``table`` (Float, flat) contains one or more values per cell. The x index varies fastest.
     """
 
     to_cell: NDArray[np.float64]
@@ -61,7 +61,7 @@ class Cells:
 
 
 def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
-    """Create cells with these values (each an array with one entry per cell of ``bounds``)."""
+    """Create cells from ``values``. Each array in ``values`` has one entry per cell of ``bounds``."""
     shape = tuple(n + 2 for n in bounds.shape)
     count = int(np.prod(bounds.shape))
     i = dr.arange(mi.UInt32, count)
@@ -110,7 +110,10 @@ def clip(box: mi.ScalarBoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float
 
 @dataclass(frozen=True)
 class CellWalk:
-    """A ray in cell space. The ray leaves cell (i, j, k) along axis x at the distance i · inverse_x + offset_x."""
+    """A ray o + t d in cell space.
+
+    In cell (i, j, k), it meets the next face perpendicular to the x axis at the distance i · inverse_x + offset_x.
+    """
 
     inverse: mi.Vector3f  # 1/d; 0 for axes perpendicular to the ray
     offset: mi.Vector3f  # ([d > 0] - o)/d; infinite for axes perpendicular to the ray
@@ -128,15 +131,15 @@ class CellWalk:
 
 
 def begin(cells: Cells, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> CellWalk:
-    """Start a traversal from distance a to b, both inside the bounding box."""
+    """Start a traversal of the ray from distance ``a`` to distance ``b``. Both points lie inside the bounding box."""
     o, d = _transformed(cells.to_cell, ray)
     still, forward = d == 0, d > 0
     inverse = dr.select(still, 0, dr.rcp(d))
     offset = dr.select(still, dr.inf, (dr.select(forward, mi.Vector3f(1), mi.Vector3f(0)) - o) * inverse)
     inner = mi.Vector3f([n - 2 for n in cells.shape])
     start = dr.clip(dr.floor(dr.fma(d, a, o)), 1, inner)
-    # The traversal ends at the far side of the last inner cell at the latest. The distance to it is computed as in the
-    # traversal, so that both have the same rounding error.
+    # The traversal ends at the far side of the last inner cell at the latest. The distance to this side is computed by
+    # the formula of `CellWalk.crossing`, so that the two distances to the side have the same rounding error.
     last = dr.fma(dr.select(forward, inner, mi.Vector3f(1)), inverse, offset)
     stride = dr.select(forward, mi.Vector3f(1), mi.Vector3f(-1))
     return CellWalk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))
@@ -159,10 +162,10 @@ def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi
 def free_flight(
     cells: Cells, box: mi.ScalarBoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool | bool
 ) -> tuple[mi.Float, mi.Float]:
-    """Sample the distance of the next tentative collision; return the distance and the majorant there.
+    """Sample the distance of the next tentative collision. Return the distance, and the majorant at this distance.
 
     The distance t solves ∫_0^t m ds = -log(1 - u), with ``u`` in [0, 1). The majorant m (1 / unit length) is the value
-    of the cell, and 0 outside ``box``. If there is no solution, the distance is infinite and the majorant 0.
+    of the cell, and 0 outside ``box``. If there is no solution, the distance is infinite and the majorant is 0.
     """
     a, b = clip(box, ray)
     τ = -dr.log(1 - u)
@@ -197,12 +200,13 @@ def free_flight(
 
 
 def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Compute the control density c and the rate m of residual collisions per cell.
+    """Compute two values for each cell: the control density c, and the rate m of residual collisions.
 
-    The density σ is ``scale`` times the volume. The relative variance of the transmittance is exp(∫ (σ - c)²/m ds) - 1.
-    On average, the integral is smallest if c is the mean density of the cell. However, the integral over a cell can be
-    large for a ray on which σ is always the lowest density of the cell. Therefore, c is limited, so that the integral
-    does not exceed RISK on such a ray. The limit is computed for twice the mean length of a ray in a cell.
+    The density σ is ``scale`` times the value of the volume. The relative variance of the transmittance is
+    exp(∫ (σ - c)²/m ds) - 1. On average over rays, the integral is smallest if c is the mean density of the cell.
+    However, the integral over a cell can be large for a ray on which σ is always the lowest density of the cell.
+    Therefore, c is limited, so that the integral does not exceed RISK on such a ray. The limit is computed for a ray
+    whose length in the cell is twice the mean length.
     """
     lowest, highest = _scaled(bounds, scale)
     length = 2 / bounds.faces_per_length  # twice the mean length of a ray in a cell
@@ -212,7 +216,10 @@ def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
 
 
 def majorants(bounds: Bounds, scale: mi.Float) -> mi.Float:
-    """Return an upper bound of the density per cell. Negative bounds, which optimisers may cause, are set to 0."""
+    """Return an upper bound of the density in each cell.
+
+    Negative bounds are set to 0. They occur if an optimiser makes densities negative.
+    """
     return dr.fmax(_scaled(bounds, scale)[1], 0)
 
 
@@ -230,10 +237,11 @@ def transmittance(
     sampler: mi.Sampler,
     active: mi.Bool | bool,
 ) -> mi.Spectrum:
-    """Estimate exp(-∫ σ ds) along the ray per channel (UnpolarizedSpectrum) without bias: residual ratio tracking.
+    """Estimate exp(-∫ σ ds) along the ray without bias, by residual ratio tracking (Novák et al. 2014).
 
-    The estimate is T = exp(-∫ c ds) Π (1 - (σ - c)/m), with control density c and rate m per cell (Novák et al. 2014).
-    The product is over the residual collisions, which are sampled with the rate m. ``density(t, active)`` evaluates σ.
+    The result is an UnpolarizedSpectrum with one estimate exp(-∫ c ds) Π (1 - (σ - c)/m) per channel. The product is
+    over the residual collisions, which are sampled with the rate m. ``cells`` contains the control density c and the
+    rate m of each cell. ``density(t, active)`` evaluates σ at distance t.
     """
     a, b = clip(box, ray)
     trace = begin(cells, ray, a, b)

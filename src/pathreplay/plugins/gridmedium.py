@@ -4,8 +4,8 @@ With V, A and Q the volumes `sigma_t`, `albedo` and `emission`, and s the `scale
 
     σ_t = s V(x),   σ_s = A(x) σ_t,   emitted radiance per unit length = Q(x)   (Q is not scaled) .
 
-With the volume `radiance` B in place of `emission`, Q(x) = σ_t B(x): an optically thick medium without scattering has
-the radiance B.
+If the volume `radiance`, B, is given instead of `emission`, then Q(x) = σ_t B(x). An optically thick medium without
+scattering then emits the radiance B.
 
 Mitsuba's integrators use a global majorant and ignore the emission. The integrators of this package call `free_flight`
 (local majorants), `transmittance` (residual ratio tracking) and `emission_at`.
@@ -134,7 +134,10 @@ class GridMedium:
             self._choose_cells()
 
     def _choose_cells(self) -> None:
-        """Build tables of majorants and control densities for the current scale, each with the cheapest cell size."""
+        """Build a table of majorants and a table of control densities for the current scale.
+
+        Each table has the cell size that is cheapest for its purpose.
+        """
         scale = dr.detach(self.scale)
         # Emission and the derivative of in-scattering are estimated at tentative collisions. Empty cells therefore also
         # need tentative collisions. Their majorant is the inverse of the mean chord length of the box, which gives one
@@ -151,9 +154,9 @@ class GridMedium:
         dr.make_opaque(self.majorant)
 
     def _cheapest_cells(self, values: Sequence[tuple[mi.Float, ...]]) -> grid_traversal.Cells:
-        """Return cells with the values of the cheapest cell size in ``self.levels``.
+        """Return the cells of the cheapest level in ``self.levels``, with the values of this level.
 
-        ``values`` has one tuple per cell size. The last entry of a tuple contains the collision rates of the cells.
+        ``values`` has one tuple per level. The last entry of a tuple contains the collision rates of the cells.
         """
         rates = [dr.mean(numbers[-1]) for numbers in values]
         dr.eval(values, rates)
@@ -196,7 +199,7 @@ class GridMedium:
     # ------------------------------------------ interface of pathreplay ------------------------------------------
 
     def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool | bool = True) -> tuple[mi.Float, mi.Float]:
-        """Sample the distance to the next tentative collision, and return it with the local majorant. Detached.
+        """Sample the distance to the next tentative collision. Return the distance and the local majorant, detached.
 
         The distance t solves ∫_0^t m ds = -log(1 - u), with ``u`` in [0, 1). The local majorant m is at least σ_t in
         all channels, and 0 outside the medium's bounding box. If there is no solution below ray.maxt, the distance is
@@ -208,7 +211,7 @@ class GridMedium:
     def transmittance(
         self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool | bool = True
     ) -> mi.UnpolarizedSpectrum:
-        """Estimate exp(-∫_0^{ray.maxt} σ_t ds) per channel without bias. Detached."""
+        """Return an unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) for each channel. The estimate is detached."""
         with dr.suspend_grad():
             ray, scale = dr.detach(ray), dr.detach(self.scale)
 
@@ -220,18 +223,18 @@ class GridMedium:
             return grid_traversal.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
 
     def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool | bool = True) -> mi.UnpolarizedSpectrum:
-        """Return the radiance emitted per unit length at an interaction; 0 without emission.
+        """Return the radiance emitted per unit length at an interaction. The result is 0 without emission.
 
-        If ``emission_per_extinction``, the result is the radiance emitted per unit of optical depth.
+        If ``emission_per_extinction`` is set, the result is the radiance emitted per unit of optical depth instead.
         """
         return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, _recordable(active))
 
 
 def _recordable(active: mi.Bool | bool) -> mi.Bool | bool:
-    """Return the mask for a lookup outside of a virtual call, which a frozen function may record.
+    """Return the mask for a volume lookup that a frozen function may record outside of a virtual call.
 
-    On a GPU all lanes look up the volume. Dr.Jit 1.5 replaces the texture of masked lanes by a null pointer, and aborts
-    the process when it records a kernel with this pointer.
+    On a GPU the mask is True, so that all lanes look up the volume. For masked lanes, Dr.Jit 1.5 replaces the texture
+    by a null pointer. When a frozen function records a kernel with this pointer, Dr.Jit aborts the process.
     """
     return True if device_of(mi.variant()).is_gpu else active
 
@@ -271,9 +274,9 @@ def _choice(props: mi.Properties) -> bool | str:
 
 
 def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
-    """Return whether the channels of a volume may differ, and a list of the bounds of the volume's values.
+    """Return whether the channels of a volume may differ, and bounds of the volume's values.
 
-    The list has one entry (see `Bounds`) per cell size, from fine to coarse.
+    The bounds are a list with one `Bounds` object per cell size, from the smallest to the largest cells.
     """
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]

@@ -25,12 +25,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-#: Number of voxels along the side of the smallest cell. With half this number, there would be eight times as many
-#: cells, and rays would take twice as many steps.
+#: Number of voxels along the side of the smallest cell. If the side were half as long, there would be eight times as
+#: many cells, and rays would take twice as many steps.
 BASE = 4
 #: Lowest, mean and highest value (TensorXf, z y x), one entry per voxel or cell.
 Values: TypeAlias = "tuple[mi.TensorXf, mi.TensorXf, mi.TensorXf]"
-#: Cost of a step between cells relative to a tentative collision: see `pathreplay bench supergrid`.
+#: Cost of a step between cells, where the cost of a tentative collision is 1 (`pathreplay bench supergrid`).
 STEP_COST = 0.15
 
 
@@ -51,10 +51,10 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Lowest, mean and highest value in cubic cells, with x varying fastest (Float, one entry per cell).
+    """Lowest, mean and highest value of a volume in cubic cells, over all channels.
 
-    ``to_cell`` (3 x 4) maps world space to cell space, where cell i of an axis covers [i, i + 1]. ``shape`` is the
-    number of cells along x, y, z. The values are taken over all channels.
+    Each of the three is a Float with one entry per cell. The x index varies fastest. ``to_cell`` (3 x 4) maps world
+    space to cell space, where cell i of an axis covers [i, i + 1]. ``shape`` is the number of cells along x, y, z.
     """
 
     to_cell: NDArray[np.float64]
@@ -65,7 +65,10 @@ class Bounds:
 
     @property
     def faces_per_length(self) -> float:
-        """Mean number of cell faces that a ray of random direction crosses per unit length (|d_k| has mean 1/2)."""
+        """Mean number of cell faces that a ray of random direction d crosses per unit length.
+
+        The mean of |d_k| is 1/2 for each axis k.
+        """
         return float(np.linalg.norm(self.to_cell[:, :3], axis=1).sum() / 2)
 
     @property
@@ -117,7 +120,7 @@ def _corners(volume: mi.Volume) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def constant_bounds(volume: mi.Volume, lowest: float, mean: float, highest: float) -> Bounds:
-    """Return a single cell for a volume with known extreme values."""
+    """Return bounds with a single cell that covers the whole volume, for known extreme values."""
     low, high = _corners(volume)
     scale = 1 / np.maximum(high - low, 1e-30)
     to_cell = np.concatenate([np.diag(scale), (-low * scale)[:, None]], axis=1)
@@ -171,11 +174,13 @@ def _channels(data: mi.TensorXf) -> Values:
 
 
 def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np.int64]:
-    """Return the voxels that lookups in each cell may use (cells x voxels), for the range low..high of an axis.
+    """Return the voxel indices that lookups in each cell may use along one axis.
 
-    With trilinear interpolation, a lookup uses the cell's own voxels and one more voxel on either side. A voxel outside
-    the n voxels of the axis is replaced by the last voxel (clamp), the voxel at the other end (repeat), or the mirror
-    image. Short rows are filled with repetitions of their voxels.
+    The result has one row per cell. The cells cover the voxels from ``low`` to ``high`` of the axis. With trilinear
+    interpolation, a lookup uses the cell's own voxels and one more voxel on either side. A voxel outside of 0 to n - 1
+    is replaced by one voxel for each wrap mode: the last voxel (clamp), the voxel at the other end (repeat), and the
+    mirror image (mirror). Rows with fewer indices than the longest row are filled by repeating their indices. If
+    ``neighbours`` is False, only the cell's own voxels are returned.
     """
     rows = []
     for start in range(low, high, BASE):
@@ -191,7 +196,11 @@ def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np
 
 
 def _merged(values: Values, axis: int, near: NDArray[np.int64], inside: NDArray[np.int64]) -> Values:
-    """Merge values along axis 0, 1 or 2 (x, y, z): extremes over indices ``near``, means over indices ``inside``."""
+    """Merge values along axis 0, 1 or 2 (x, y, z).
+
+    ``near`` and ``inside`` have one row of indices per merged cell. The extremes are taken over the indices in
+    ``near``, and the means over the indices in ``inside``.
+    """
 
     def pool(value: mi.TensorXf, table: NDArray[np.int64], merge: Callable) -> mi.TensorXf:
         before = [slice(None)] * (2 - axis)

@@ -1,4 +1,4 @@
-"""A figure of derivative images beside finite differences, in diverging colours of one scale."""
+"""A figure of derivative images beside finite differences. All images have the same diverging colour scale."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 from pathreplay.report.drawing import Figure, own_settings
 
-# The end of the colour scale, as a percentile of the absolute finite differences. Few pixels exceed it.
+# The end of the colour scale, as a percentile of the absolute finite differences. Few pixels exceed the colour scale.
 _PERCENTILE = 99.0
 
 
 def derivatives_figure(rows: Sequence[tuple[str, str, np.ndarray, np.ndarray]], format: str) -> bytes:
-    """Draw derivatives, finite differences, and the differences of both.
+    """Draw derivatives, finite differences, and the differences between the two.
 
     Args:
         rows: key, name of the integrator, derivative image and finite differences (height x width x channels) of each

@@ -1,8 +1,8 @@
 """Writes the live page of a run and its preview images, and reacts to the file that requests a stop.
 
 The folder ``previews`` contains the content of the page (``page.json``), the images of the page, and the frames of
-time-lapse films. The names of the frames have the form ITERATION-WHAT-NAME.webp. A run can be resumed without these
-files. A preview that cannot be rendered or written is omitted, and never ends a run.
+time-lapse films. The names of the frames have the form ITERATION-WHAT-NAME.webp, where WHAT is view, texture or volume.
+A run can be resumed without these files. A preview that cannot be rendered or written is omitted, and the run goes on.
 """
 
 from __future__ import annotations
@@ -161,7 +161,10 @@ class Previews:
         return files
 
     def _begun(self) -> dict[str, bytes]:
-        """Return the first preview files by name: images of the views, and initial and true textures and volumes."""
+        """Return the first preview files by name.
+
+        The files contain images of the views, and the initial and true values of textures and volumes.
+        """
         files = self._of_views()
         for item in recovered_of(self.problem, self.run):
             for kind, image in _grids(item).items():
@@ -185,7 +188,7 @@ class Previews:
         """Clean up files of an earlier part of the run. Called after the first step, when resuming has succeeded.
 
         A killed run may have written frames after its last checkpoint. These frames are removed, because the resumed
-        run repeats these iterations.
+        run repeats the iterations after the checkpoint.
         """
         self._remove_frames(lambda iteration: iteration > self._resumed)
         self._kept = sorted({0, *(iteration for iteration, _, _ in frames(self.folder.path))})
@@ -267,7 +270,10 @@ class Previews:
 
 
 def _grids(item: Recovered) -> dict[str, Image]:
-    """Return the initial and the true value (if known) of a texture or volume as images; empty for other parameters."""
+    """Return the initial and the true value (if known) of a texture or volume as images, by kind.
+
+    The dictionary is empty for other parameters.
+    """
     return {kind: image for kind, image in (item.textures() or item.volumes()).items() if kind in ("start", "truth")}
 
 
@@ -276,13 +282,16 @@ def _address(kind: str, item: Recovered) -> str:
 
 
 def frames(run: Path) -> Iterator[tuple[int, str, Path]]:
-    """Yield iteration, subject and file of each time-lapse frame in a run folder, in order of the iterations."""
+    """Yield iteration, subject and file of each time-lapse frame in a run folder, in order of the iterations.
+
+    The subject names the view, texture or volume that the frame shows, for example 'view-front'.
+    """
     matches = [(FRAME.fullmatch(path.name), path) for path in (run / FOLDER).glob("*.webp") if not path.is_symlink()]
     yield from sorted((int(match[1]), match[2], path) for match, path in matches if match)
 
 
 def films(run: Path, most_bytes: int | None = None) -> dict[str, tuple[Still, ...]]:
-    """Return the time-lapse frames of a run by subject: a view, texture or volume.
+    """Return the time-lapse frames of a run by subject; see `frames`.
 
     With ``most_bytes``, frames are embedded as data URIs. Only every n-th frame is then returned, so that the total
     size of the frames is about ``most_bytes``. Without ``most_bytes``, all frames are returned, with addresses relative

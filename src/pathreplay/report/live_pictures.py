@@ -33,7 +33,7 @@ CAPTIONS = {"target": "target", "result": "now", "difference": f"difference ×{D
 
 
 class LivePictures:
-    """Latest images of some views of a run.
+    """The most recently rendered images of some views of a run.
 
     ``before`` contains the images at the initial values by view name. By default, the constructor renders these images.
     """
@@ -73,7 +73,7 @@ class LivePictures:
 
     def is_due(self, seconds: float) -> bool:
         """Return whether images are due after an iteration that took ``seconds``."""
-        # The time to render images is unknown before the first images. The time of an iteration is an upper bound.
+        # Before the first images, their rendering time is unknown. The time of an iteration serves as an estimate.
         allowed = self.share * (time.perf_counter() - self._began)
         return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
 

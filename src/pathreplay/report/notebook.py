@@ -28,7 +28,7 @@ def in_notebook() -> bool:
 class NotebookPanel:
     """Shows the progress of a job in a notebook, with the interface of `Progress`.
 
-    It is a context manager; the last state stays visible after the block.
+    The panel is a context manager. The last state of the panel stays visible after the block.
     """
 
     def __init__(self) -> None:

@@ -53,7 +53,10 @@ class ViewPictures:
 
     @cached_property
     def likenesses(self) -> dict[str, Likeness]:
-        """Return weighted image metrics at the view's exposure, by kind: 'result', 'start' and, if any, 'baseline'."""
+        """Return image metrics by kind of image: 'result', 'start' and, if there is a baseline, 'baseline'.
+
+        The metrics compare the image with the target, at the view's exposure and with the weights of the pixels.
+        """
         images = {"result": self.result, "start": self.start, "baseline": self.baseline}
         return {
             kind: Likeness.of(image, self.target, self.exposure, self.weight, flip=self.is_test)
@@ -127,7 +130,7 @@ class Recovered:
     def volumes(self) -> dict[str, Image]:
         """Return the middle slices of initial value, result, baseline's result and truth as images by kind.
 
-        White is the maximum of the truth, or the maximum of the result if the truth is unknown. All volumes are first
+        The maximum of the truth, or of the result if the truth is unknown, is shown as white. All volumes are first
         resampled to the resolution of the finest volume. The dictionary is empty unless the parameter is a volume (z,
         y, x, one to four channels).
         """
@@ -176,13 +179,13 @@ class Recovered:
 
 
 def number_of(items: Iterable[Recovered]) -> int:
-    """Return the number of parameters, without those that are computed from other parameters."""
+    """Return the number of parameters, without parameters that are computed from other parameters."""
     return sum(not item.derived for item in items)
 
 
 @dataclass(frozen=True)
 class RecoveredPose:
-    """A pose of a run: initial and resulting parts, which are a translation and a rotation vector (degrees)."""
+    """A pose of a run. The parts of a pose are a translation and a rotation vector (degrees)."""
 
     pose: Pose
     start: dict[str, Array]
@@ -192,7 +195,10 @@ class RecoveredPose:
     value_at_start: Array
 
     def errors(self) -> dict[str, PoseError]:
-        """Return the errors of result and initial value ('error', 'error_at_start'); empty if the truth is unknown."""
+        """Return the error of the result ('error') and of the initial value ('error_at_start'), by these names.
+
+        The dictionary is empty if the truth is unknown.
+        """
         values = {"error": self.value, "error_at_start": self.value_at_start}
         return {kind: error for kind, value in values.items() if (error := self.pose.error(value)) is not None}
 

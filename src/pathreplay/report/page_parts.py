@@ -25,21 +25,27 @@ def uri(kind: str, data: bytes) -> str:
 
 
 def common_exposure(targets: Sequence[Image]) -> float:
-    """Return one display exposure for all views, at which 98 % of the (subsampled) target pixels are below white."""
+    """Return one display exposure for all views, at which 98 % of the target pixels are darker than white.
+
+    If there are many target pixels, a subset of them is used.
+    """
     step = max(1, sum(target.shape[0] * target.shape[1] for target in targets) // MOST_LEVELS)
     levels = [target[..., :3].max(axis=2).reshape(1, -1, 1)[:, ::step] for target in targets]
     return exposure_for(np.concatenate(levels, axis=1)) if levels else 1.0
 
 
 def lead(config: Config, parameters: int, learned: int, test_views: int) -> tuple[str, str, str]:
-    """Return the sentence at the top of a page in three parts: parameters, name of the scene, and number of images."""
+    """Return the sentence at the top of a page in three parts.
+
+    The parts contain the number of parameters, the name of the scene, and the number of images.
+    """
     test = f", {test_views} test view{'s' if test_views != 1 else ''}" if test_views else ""
     images = f" recovered from {learned} image{'s' if learned != 1 else ''}{test}"
     return f"{parameters} parameter{'s' if parameters != 1 else ''} of ", config.scene, images
 
 
 def dropped_notice(history: Sequence[Entry]) -> tuple[str, ...]:
-    """Return a notice that gradient entries were not finite, or nothing if all were finite."""
+    """Return a notice if some gradient entries were not finite, otherwise an empty tuple."""
     dropped = sum(entry.dropped for entry in history)
     return (f"{dropped} gradient entries were NaN or infinite and were set to zero.",) if dropped else ()
 
@@ -59,8 +65,9 @@ def facts(config: Config, history: Sequence[Entry]) -> tuple[tuple[str, str], ..
 def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
     """Return plots over the iterations.
 
-    One plot shows the loss. For each parameter, plots show its error (if the truth is known), and the norms of its
-    gradient and gradient noise. Regularizers are plotted if present, and samples per pixel if they vary.
+    One plot shows the loss. Each parameter has a plot of its error (if the truth is known), and a plot of the norms of
+    its gradient and of the noise of its gradient. There is a plot of regularizers if the job has any, and a plot of the
+    samples per pixel if their number varies.
     """
     entries = [history[i] for i in thinned(len(history))]
     x = tuple(float(entry.iteration) for entry in entries)
@@ -78,7 +85,7 @@ def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
     if not history:
         return tuple(drawn)
     errors, norms = history[-1].errors, history[-1].gradient_norms
-    for key in dict.fromkeys([*norms, *errors]):  # the errors of a pose have other keys than its gradients
+    for key in dict.fromkeys([*norms, *errors]):  # a pose has different keys for its errors and for its gradients
         if key in errors:
             drawn.append(plot("error of", key, error=(entry.errors.get(key) for entry in entries)))
         if key in norms:

@@ -13,15 +13,15 @@ from rich.console import Console
 from pathreplay.errors import plain_line
 from pathreplay.inverse.loop.events import Event, Notes, Started, Stepped
 
-# Without a bar: minimum seconds between two lines, so that the log of a long run stays readable.
+# Minimum seconds between two lines if there is no bar. With this limit, the log of a long run stays readable.
 _SECONDS = 10.0
 
 
 class _Forgiving:
     """Stream that writes to stderr and ignores errors: a closed terminal must not keep a run from writing its results.
 
-    It ignores write errors, a missing stderr (None in a program without a console), and the RuntimeError that Python
-    raises if a signal handler prints while the interrupted code is printing.
+    The stream ignores write errors, a missing stderr (None in a program without a console), and the RuntimeError that
+    Python raises if a signal handler prints while the interrupted code is printing.
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class _Forgiving:
 class Progress:
     """Context manager that shows the progress of a job if ``shown`` is set, and otherwise shows nothing.
 
-    The notebook bar of rich is not used, because it shows nothing without ipywidgets. `NotebookPanel` replaces it.
+    In notebooks, `NotebookPanel` is used instead, because the progress bar of the package rich needs ipywidgets there.
     """
 
     def __init__(self, shown: bool) -> None:

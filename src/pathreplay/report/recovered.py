@@ -1,6 +1,6 @@
 """Collects the parameters of a run, each with its initial value, result and truth.
 
-All values are decoded values, as `scenes.stored` defines them.
+All values are decoded values, which differ from the form that Mitsuba stores; see `scenes.stored`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathreplay.scenes.parameters import get_array
 
 
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
-    """Return the parameters that are not poses. Derived parameters come last."""
+    """Return the parameters that are not poses. Parameters that are computed from other parameters come last."""
     parts = {name for pose in problem.poses for name in pose.of}
     truths = [(v.key, v.truth) for v in problem.variables if v.key not in parts and v.key not in (EXPOSURE, RESPONSE)]
     derived = {parameter.key: parameter.truth for parameter in problem.derived}
@@ -60,9 +60,9 @@ def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
 
 
 def with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
-    """Return ``values``, and the values of the poses and derived parameters that are computed from ``values``.
+    """Return ``values`` together with the poses and derived parameters that are computed from ``values``.
 
-    ``values`` contains the decoded values of the variables by key.
+    ``values`` contains the decoded values of the variables by key. The result contains all values by key.
     """
     inputs = {name for computed in problem.made() for name in computed.of}
     if not inputs:

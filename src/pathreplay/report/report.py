@@ -49,12 +49,12 @@ MOST_FACES = 50_000
 
 Film = tuple[Still, ...]
 
-# Largest number of parameters whose errors are plotted in the comparison, next to the image error.
+# Largest number of parameters whose errors are plotted in the comparison. The image error is always plotted.
 PANELS = 2
 
 
 def report_files(outcome: Outcome, films: Mapping[str, Film] | None = None) -> dict[str, bytes]:
-    """Return the content of report.html, of the curves (SVG, PNG) and of summary.png, by file name.
+    """Return the content of report.html, of the files with curves (SVG, PNG) and of summary.png, by file name.
 
     ``films`` are time-lapse frames by subject; see `live_page.films`.
     """
@@ -157,7 +157,7 @@ def _likeness_note(outcome: Outcome) -> str:
 
 
 def _shown(outcome: Outcome) -> tuple[list[ViewPictures], float]:
-    """Return the views whose images are in the report, and the factor by which the images are scaled."""
+    """Return the views whose images are in the report, and the factor for the width and height of these images."""
     views = list(outcome.views)
     if len(views) > MOST_VIEWS:
         views = [views[i * len(views) // MOST_VIEWS] for i in range(MOST_VIEWS)]
@@ -196,7 +196,10 @@ def _views(outcome: Outcome, exposure: float, films: Mapping[str, Film]) -> tupl
 
 
 def _mesh(item: Recovered) -> Mesh | None:
-    """Return an interactive mesh of initial value, result and truth; None if there are no faces, or too many."""
+    """Return an interactive mesh with the initial value, the result and the truth of a parameter.
+
+    The result is None if the parameter has no faces or too many.
+    """
     if item.faces is None or item.faces.size > 3 * MOST_FACES:
         return None
     known = {
@@ -297,7 +300,7 @@ def _plain(axes: Axes, along: str) -> None:
         axes.spines[side].set_visible(False)
 
 
-# Largest number of views in summary.png, and largest number of textures and volumes together.
+# Largest number of views in summary.png. It is also the largest total number of textures and volumes.
 SUMMARY_ROWS = 3
 SUMMARY_SIDE = 512
 """Side in pixels to which larger images are downscaled, to save memory. Images are drawn with a width of 210 pixels."""
@@ -334,7 +337,7 @@ def summary(outcome: Outcome) -> bytes:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions and system properties that affect a run in addition to its config, by name."""
+    """Return the versions of packages and the properties of the system that affect the results of a run, by name."""
     return {
         "pathreplay": __version__,
         "Mitsuba": version("mitsuba"),

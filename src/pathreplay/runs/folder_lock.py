@@ -22,9 +22,9 @@ LOCK = "lock"
 class FolderLock:
     """Locks a file in ``folder`` from construction to `close`.
 
-    The lock is an advisory lock on the file (flock). The file remains when the lock is released, and does not block
-    other processes then. The system releases the lock when the process ends for any reason. If the file system or the
-    operating system does not support flock, nothing is locked.
+    The lock is an advisory lock on the file (flock). The system releases the lock when the process ends for any reason.
+    The file remains after the lock is released, and does not block other processes. If the file system or the operating
+    system does not support flock, nothing is locked.
 
     Raises PathreplayError if another process or thread holds the lock, or if the folder cannot be written.
     """

@@ -1,4 +1,7 @@
-"""The run folder on disk: each run gets a new one, files are written atomically, and earlier runs stay untouched."""
+"""The run folder on disk. Each run gets a new folder, and never changes the folder of an earlier run.
+
+Files are written atomically.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +81,7 @@ class RunFolder:
     @property
     def name(self) -> Path:
         """Return the path to show to the user, which is valid from the current folder."""
-        with contextlib.suppress(OSError):  # the current folder may be gone
+        with contextlib.suppress(OSError):  # the current folder may have been removed
             if Path.cwd() == self.home:
                 return self.given
         return self.path
@@ -114,8 +117,8 @@ class RunFolder:
     def write(self, files: Mapping[str, Content]) -> None:
         """Write all files or none: each file is written under a temporary name, and then all files are renamed.
 
-        A symbolic link in the place of a file is replaced instead of followed. Content given as a function (see
-        `Content`) is in memory only while it is written.
+        A symbolic link in the place of a file is replaced instead of followed. If the content of a file is given as a
+        function (see `Content`), the content is in memory only while the file is written.
 
         Args:
             files: content by file name relative to the folder; missing subfolders are created.
@@ -129,7 +132,8 @@ class RunFolder:
         lost = "unwritten data is"
         with _opened(self.path) as descriptor:
             self.require_in_place(lost, descriptor)
-            # Paths are relative to the open folder, because something else may take the path of the folder meanwhile.
+            # Paths are relative to the open folder. During the call, the folder may be renamed, and another folder may
+            # take its path.
             base = self.path if descriptor is None else Path()
             try:
                 for name, content in files.items():
@@ -296,7 +300,7 @@ def _config_in(path: Path) -> Path:
 
 def _job(path: Path, copy: Path) -> Job:
     try:
-        if problem := file_problem(path / "run.json", 2**20):  # limit in bytes, far more than a few paths need
+        if problem := file_problem(path / "run.json", 2**20):  # the limit is far more than a few paths need
             raise ValueError(f"it {problem}")
         origin = _Origin.model_validate_json((path / "run.json").read_bytes())
         if "\0" in origin.base + (origin.config or ""):
@@ -340,7 +344,7 @@ def require_writable_name(path: Path, option: str) -> None:
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Remove the folders, except those into which another process has put files."""
+    """Remove the folders that are empty. Another process may have put files into a folder."""
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()

@@ -25,7 +25,7 @@ CAPTURE = "capture.sha256"
 
 
 class Saving:
-    """Writes checkpoints of a run into its folder after ``every`` iterations and at the end."""
+    """Writes a checkpoint of a run into its folder at intervals of ``every`` iterations, and at the end of the run."""
 
     def __init__(self, folder: RunFolder, run: Run, every: int) -> None:
         self.folder, self.run, self.every = folder, run, every
@@ -44,15 +44,15 @@ class Saving:
             self._write(event.done)
 
     def close(self) -> None:
-        """Save iterations that are not saved yet. Raises the same errors as `observe`."""
+        """Save the iterations that are not saved yet. Raises the same errors as `observe`."""
         if self._runs_are_whole() and len(self.run.history) > self.saved:
             self._write(len(self.run.history))
 
     def rescued(self) -> bool:
-        """Save the remaining iterations after an error of the run, and return whether all iterations are saved."""
+        """Try to save the iterations before an error of the run. Return whether all iterations are saved."""
         if not self._runs_are_whole() or not self.run.history:
             return False
-        with contextlib.suppress(PathreplayError):  # the caller reports the error of the run
+        with contextlib.suppress(PathreplayError):  # the caller reports the error of the run instead
             self.close()
         return self.saved == len(self.run.history)
 
@@ -65,10 +65,10 @@ class Saving:
 
 
 def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, Content]:
-    """Return the initial files of a run, by name: targets, weights, initial images, checksums, and checkpoints.
+    """Return the initial files of a run by name. The run can be resumed from these files.
 
-    The checksums cover the targets, weights and images. The run can be resumed from these files. ``before`` are the
-    images at the initial values by view name.
+    The files contain the targets, the weights, the images at the initial values, their checksums, and the checkpoints.
+    ``before`` contains the images at the initial values by view name.
     """
     pictures = {_picture("target", view.name): view.target for view in problem.views}
     pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}
@@ -96,7 +96,7 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
         folder: the run folder.
         problem: the problem of the run.
         run: the run to restore, which is modified.
-        held: keys of variables that stages may freeze.
+        held: keys of variables that a stage of the optimization may freeze.
 
     Returns:
         The images at the initial values by view name.
@@ -124,7 +124,7 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
 
 
 def _require_capture(path: Path, problem: Problem) -> None:
-    """Raise PathreplayError if the capture's cameras have changed since the start of the run."""
+    """Raise PathreplayError if the camera poses of the job's ``capture`` have changed since the start of the run."""
     if problem.capture is None:
         return
     try:

@@ -1,4 +1,4 @@
-"""Counter-based random numbers for paths and boundary segments: a pure function of key and index."""
+"""Counter-based random numbers for paths and boundary segments. Each number is a function of a key and an index."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ class CounterSampler:
 
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
         x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # the two halves of a cipher block
-        self.index += 2  # with two indices per 2D sample, a vertex uses six indices (see `at_vertex`)
+        self.index += 2  # a 2D sample uses two indices, and a vertex uses six (see `at_vertex`)
         return mi.Point2f(_in_unit(x), _in_unit(y))
 
 
 def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Return the key of the i-th segment of a pass.
 
-    The key must not be a function of i ^ seed. Otherwise all passes would use the same set of keys, assigned to
-    different segments, and the mean over passes would have the error of a single pass.
+    The key must not be a function of i ^ seed. Otherwise all passes would use the same set of keys in another order,
+    and the mean over many passes would be as noisy as a single pass.
     """
     return mi.sample_tea_32(i, seed, ROUNDS)[0]
 

@@ -28,7 +28,7 @@ class OwenSobolSampler:
 
     @staticmethod
     def of(path: mi.UInt32, key: mi.UInt32) -> OwenSobolSampler:
-        """Create the sampler of path number ``path`` among all paths with the same key."""
+        """Create the sampler of a path. ``path`` is the index of the path among all paths with the same ``key``."""
         return OwenSobolSampler(dr.brev(path), mi.UInt32(key), mi.UInt32(0))
 
     def clone(self) -> OwenSobolSampler:
@@ -46,7 +46,7 @@ class OwenSobolSampler:
         return mi.Point2f(_unit(_scrambled(x, key * 0x85EBCA6B)), _unit(_scrambled(_second(x), key * 0xC2B2AE35)))
 
     def _next(self) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return the key of the next dimension, and the bit-reversed path index after a shuffle with this key."""
+        """Return the key of the next dimension, and the bit-reversed path index after it was shuffled with this key."""
         key = mixed(self.key + self.drawn * _GOLDEN)
         self.drawn += 1
         return key, _permuted(self.reversed, key)
@@ -73,7 +73,7 @@ def mixed(x: mi.UInt32) -> mi.UInt32:
 
 
 def _permuted(x: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
-    """Apply the Laine-Karras permutation: each bit affects higher bits only. The constants are Burley's."""
+    """Apply the Laine-Karras permutation, in which each bit affects only higher bits. The constants are Burley's."""
     x = ((x ^ (x * 0x3D20ADEA)) + key) * ((key >> 16) | 1)
     x = x ^ (x * 0x05526C56)
     return x ^ (x * 0x53A22864)
@@ -85,7 +85,10 @@ def _scrambled(x: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
 
 
 def _second(x: mi.UInt32) -> mi.UInt32:
-    """Compute the second coordinate of a Sobol point from the first: multiply by Pascal's triangle modulo 2."""
+    """Compute the second coordinate of a Sobol point from the first coordinate.
+
+    The bits of the first coordinate are multiplied by Pascal's triangle modulo 2.
+    """
     for shift, mask in ((1, 0xAAAAAAAA), (2, 0xCCCCCCCC), (4, 0xF0F0F0F0), (8, 0xFF00FF00), (16, 0xFFFF0000)):
         x = x ^ ((x << shift) & mask)
     return x

@@ -1,4 +1,7 @@
-"""Samples for all paths of a pixel. The paths form mutually independent sets, as `pixel_sweep` requires."""
+"""Samples for all paths of a pixel.
+
+The paths are divided into sets. Different sets are independent of each other, as `pixel_sweep` requires.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ class PixelSamples(Protocol):
 
 @dataclass(frozen=True)
 class IndependentSets:
-    """Samples from a Mitsuba sampler whose samples are independent, so that each path is a separate set."""
+    """Samples from a Mitsuba sampler. All samples are independent, so that each set consists of a single path."""
 
     sampler: mi.Sampler
 

@@ -2,8 +2,8 @@
 
 Each stream has an integer value. The value is used in one of five ways, as the comments in `Stream` state:
 
-- The exclusive or of the value and a seed or key is the seed or key of the stream (`Stream.of`).
-- A hash of the value and a seed is the seed or key of the stream.
+- The stream has the seed ``seed ^ value``, or the key ``key ^ value`` (`Stream.of`).
+- The seed or key of the stream is a hash of the value and a seed.
 - The value is the first index of the stream in the sequence of a key (`CounterSampler.stream`). The lowest indices,
   from 0 on, belong to the path itself, with six indices per vertex (see `CounterSampler.at_vertex`).
 - The value is added to the initial state of a generator.
@@ -18,9 +18,9 @@ import mitsuba as mi
 
 
 class Stream(IntEnum):
-    """Purposes of random number streams."""
+    """The streams of random numbers, by purpose. The comments state how the value of a stream is used."""
 
-    # The exclusive or of the value and the seed of a pass is the seed of the stream.
+    # The seed of the stream is the seed of the pass ^ the value.
     BOUNDARY = 0x5EED  # the boundary term; the interior term uses the seed itself
     PILOT = 0x7F4A7C15  # pilot segments, whose results determine where later segments are sampled
     CAST_SHADOWS = 0x2C1B3C6D
@@ -28,9 +28,9 @@ class Stream(IntEnum):
     SECONDARY_KEYS = 0x2545F491
     VOLUMETRIC_KEYS = 0x3C6EF372
     VOLUMETRIC_CENTRES = 0x1F83D9AB
-    # A hash of the value and the seed of a pass is the key of the stream.
+    # The key of the stream is a hash of the value and the seed of the pass.
     PARTICLES = 0x68E31DA4
-    # The exclusive or of the value and the key of a path is the key of the stream.
+    # The key of the stream is the key of the path ^ the value.
     EMITTER_SEGMENTS = 0x1B873593
     ARCS = 0x38B34AE5
     # The value is the first index of the stream in the sequence of a key.
@@ -49,9 +49,9 @@ class Stream(IntEnum):
     BISECT_VOLUMETRIC = 2
     # The value is the index of an independent set of Sobol samples of a pixel (`Pass.sobol_sampler`). The interior term
     # uses set 0. The function `pixel_sweep` uses the first `pixel_samples.SETS` sets.
-    FLOW = 0x10  # paths for the gradient term of the film flow (`integrators.film.motion`)
-    FLOW_MEAN = 0x11  # paths that estimate the mean radiance, which the term of the film flow subtracts
-    # A hash of the value and the seed of an image is the seed of the stream.
+    FLOW = 0x10  # paths for the gradient term `FilmMotion` (`integrators.film.motion`)
+    FLOW_MEAN = 0x11  # paths that estimate the mean radiance, which `FilmMotion` subtracts
+    # The seed of the stream is a hash of the value and the seed of the image.
     SECOND_IMAGE = 0x2B5AD2C7  # a second, independent image of one view
     SECOND_HALF = 0x5E1C93A7  # the second half of the samples of one view
 

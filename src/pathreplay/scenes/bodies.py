@@ -35,7 +35,7 @@ def ball(splits: int) -> tuple[np.ndarray, np.ndarray]:
 def knobs(directions: np.ndarray) -> np.ndarray:
     """Return points (n, 3) on the surface of a body with four knobs. The body has length 1.
 
-    The points lie in the given unit ``directions`` (n, 3), as seen from the origin inside the body.
+    The origin is inside the body. Each point is seen from the origin in one of the unit ``directions`` (n, 3).
     """
     radius = np.full(len(directions), 0.4)
     for at, height, sharpness in _KNOBS:

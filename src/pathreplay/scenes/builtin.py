@@ -15,15 +15,15 @@ COSTS: dict[str, Callable[[int], int]] = {
     "texture": lambda n: 64 * n**2,  # per texel: three numbers, and their copies in double precision
     "grid": lambda n: 256 * n**3,  # per voxel: the 12 waves of the noise, which are in memory together
     "views": lambda n: 100_000 * n,  # per view: a sensor and its film
-    "columns": lambda n: 1000 * n**2,  # per vertex: its data and faces, if there are as many rows as columns
+    "columns": lambda n: 1000 * n**2,  # per vertex of a square height map: its data and its faces
     "rows": lambda n: 1000 * n**2,
-    "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # eight faces, each split into four n times
+    "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # per face: there are eight faces, and each split gives four
 }
 """Arguments that determine the size of a scene -> approximate memory in bytes that is needed to build the scene."""
 
 
 def _picture(pixels: np.ndarray, **options: object) -> SceneDict:
-    """Describe a bitmap texture whose values are used without colour conversion."""
+    """Describe a bitmap texture. Its values are used without colour conversion."""
     return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, **options}
 
 
@@ -49,9 +49,11 @@ def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
     T = mi.ScalarTransform4f
     scene = cornell_box(resolution)
     overview = scene.pop("sensor")
-    # A texel is hardly wider than a pixel. A wider filter would blur neighbouring texels, which slows down convergence.
+    # A texel is hardly wider than a pixel. A filter that is wider than a pixel would blur neighbouring texels, which
+    # slows down convergence.
     overview["film"]["rfilter"] = {"type": "box"}
-    # The distance from the wall is 1.3, and the wall's half width is 1: tan(fov / 2) = 1 / 1.3, plus a margin of 1 %.
+    # The camera is 1.3 in front of the wall, and the wall extends 1 to each side. Therefore tan(fov / 2) is 1 / 1.3,
+    # plus a margin of 1 %.
     near = T().look_at(origin=[0, 0, 0.3], target=[0, 0, -1], up=[0, 1, 0])
     scene |= {"overview": overview, "closeup": {**overview, "to_world": near, "fov": 75.8}}
     scene["large-box"]["to_world"] = T().translate([-0.45, -0.65, 0.42]).rotate([0, 1, 0], 18).scale([0.26, 0.35, 0.26])
@@ -66,10 +68,10 @@ def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
 def _room(radius: float) -> SceneDict:
     """Describe an emissive sphere around the origin, with poles above and below and a smooth radiance texture.
 
-    Because the texture is smooth, gradients point to the optimum from far away. Because the sphere has finite size, an
-    image also depends on the position of the camera. The radiance from direction d in colour channel c is
-    0.6 + 0.08 Σ_j cos(k_cj · d + φ_cj), with random phases φ_cj and random wave vectors k_cj (wavelengths 30 to 90
-    degrees).
+    Because the texture is smooth, gradients point to the optimum even if the initial values are far from it. Because
+    the sphere has finite size, an image also depends on the position of the camera. The radiance from direction d in
+    colour channel c is 0.6 + 0.08 Σ_j cos(k_cj · d + φ_cj), with random phases φ_cj and random wave vectors k_cj
+    (wavelengths 30 to 90 degrees).
     """
     v, u = _centres(64, 128)
     θ, φ = np.pi * v, 2 * np.pi * u
@@ -97,11 +99,11 @@ def _camera(origin: list[float], target: list[float], fov: float, resolution: in
 def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
     """Describe a thick pane of glass (index 1.5) with an uneven front in a textured room, seen by three sensors.
 
-    ``front`` looks straight through the pane. ``left`` and ``right`` look at an angle of 55 degrees, where the
-    thickness shifts the view and the front reflects more of the room. These views separate the effect of the index from
-    the effect of the slope of the surface. The key of the index is ``glass.eta``, and the key of the normal map is
-    ``front_face.bsdf.normalmap.data``. The normal map covers the middle of the pane, and contains ``texture``² normals,
-    stored as (n + 1) / 2.
+    ``front`` looks straight through the pane. ``left`` and ``right`` look at the pane at an angle of 55 degrees. At
+    this angle, the thickness of the pane shifts the view, and the front reflects more of the room. Together, the three
+    views distinguish the effect of the index from the effect of the slope of the surface. The key of the index is
+    ``glass.eta``, and the key of the normal map is ``front_face.bsdf.normalmap.data``. The normal map covers the middle
+    of the pane, and contains ``texture``² normals, stored as (n + 1) / 2.
     """
     T = mi.ScalarTransform4f
     # The pane is so wide that no path sees the rim, and its corners are inside the room.
@@ -149,10 +151,11 @@ def _bumps(size: int) -> np.ndarray:
 
 
 def mirror_camera(resolution: int = 48) -> SceneDict:
-    """Describe an old mirror with blotches in a textured room, seen by a fixed camera and by a camera that may move.
+    """Describe an old mirror with blotches in a textured room, seen by two cameras.
 
-    Both cameras see the mirror and a part of the room around it. The blotches make the image depend on the mirror's
-    position in its plane. The keys of their poses are ``camera.to_world`` and ``mirror.to_world``.
+    The camera ``tripod`` is fixed, and the camera ``camera`` may move. Both cameras see the mirror and a part of the
+    room around the mirror. Because of the blotches, the images also change if the mirror moves in its plane. The key of
+    the camera's pose is ``camera.to_world``, and the key of the mirror's pose is ``mirror.to_world``.
     """
     place = mi.ScalarTransform4f().translate([-0.4, -0.1, -1.0])
     blotches = _picture(_blotches(32))
@@ -180,8 +183,8 @@ def _blotches(size: int) -> np.ndarray:
 def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
     """Describe a small cloud (``grid``³ voxels, albedo 0.95) under a sky with a sun, seen by ``views`` sensors.
 
-    The medium fills a cube of side 2 with a null boundary, and the sensors surround the cube. The key of the density
-    (extinction per unit length) is ``cloud.interior_medium.sigma_t.data``.
+    The medium fills a cube of side 2, whose surface has a null BSDF. The sensors surround the cube. The key of the
+    density (extinction per unit length) is ``cloud.interior_medium.sigma_t.data``.
     """
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     density = {"type": "gridvolume", "grid": mi.VolumeGrid(_cumulus(grid)), "to_world": place}
@@ -204,8 +207,8 @@ def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
 def silhouettes(resolution: int = 32, views: int = 2) -> SceneDict:
     """Describe a black body of length 1 with four knobs in front of a white sky: only its silhouette is visible.
 
-    The key of the vertices is ``body.vertex_positions``. With ``views`` = 2, the cameras are 90 degrees apart. More
-    cameras are placed around the body at equal angles.
+    The key of the vertices is ``body.vertex_positions``. With ``views`` = 2, the cameras are 90 degrees apart. Three or
+    more cameras are placed around the body at equal angles.
     """
     black = {"type": "diffuse", "reflectance": 0.0}
     vertices, faces = ball(4)
@@ -254,10 +257,10 @@ def shadows(resolution: int = 32, views: int = 4, ball_splits: int = 0) -> Scene
 
 
 def silhouette_in_mirror(resolution: int = 32) -> SceneDict:
-    """Describe the body of `silhouettes` beside a mirror. One camera sees the body and, in the mirror, its other side.
+    """Describe the body of `silhouettes` beside a mirror, seen by one camera.
 
-    The width of the image is twice its height. The rim of the mirror is invisible, because the mirror reflects the same
-    white sky that surrounds it.
+    The camera sees one side of the body directly, and another side in the mirror. The width of the image is twice its
+    height. The rim of the mirror is invisible, because the white sky is behind the mirror and also reflected by it.
     """
     scene = silhouettes(resolution, views=1)
     camera = _camera([0.5, 0, 4], [0.5, 0, 0], 36, resolution)
@@ -278,7 +281,7 @@ def flat_colours(resolution: int = 32) -> SceneDict:
     """Describe emissive panels of one colour each, at different distances before a black background.
 
     Each panel has uniform radiance, so small motions change an image only at edges. The camera looks at
-    the panels from a distance of 3. The key of its pose is ``camera.to_world``.
+    the panels from a distance of 3. The key of the camera's pose is ``camera.to_world``.
     """
 
     def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> mi.ScalarTransform4f:
@@ -298,8 +301,8 @@ def flat_colours(resolution: int = 32) -> SceneDict:
 def glass_ball(resolution: int = 32) -> SceneDict:
     """Describe a glass sphere (index 1.5, radius 0.5) in front of panels of one colour each.
 
-    The sphere is visible only because it refracts and reflects light. The key of its index is ``glass.eta``, and
-    the key of its pose is ``ball.to_world``.
+    The sphere is visible only because it refracts and reflects light. The key of the sphere's index of refraction is
+    ``glass.eta``, and the key of the sphere's pose is ``ball.to_world``.
     """
 
     def at(x: float, y: float, z: float, width: float, height: float) -> mi.ScalarTransform4f:
@@ -343,9 +346,9 @@ def _cumulus(size: int) -> np.ndarray:
 
 
 def _sky(rows: int) -> np.ndarray:
-    """Return a sky with a sun, blue above and dim below.
+    """Return an environment map of a sky with a sun. The sky is blue above and dim below.
 
-    The sun is 50 degrees high. It is blurred over 8 degrees, so that paths hit the sun.
+    The elevation of the sun is 50 degrees. The sun is blurred over 8 degrees, so that paths hit it.
     """
     v, u = _centres(rows, 2 * rows)
     θ, φ = np.pi * v, 2 * np.pi * u

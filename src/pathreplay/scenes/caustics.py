@@ -38,13 +38,13 @@ def caustic_lens(  # noqa: PLR0913 (keywords of a job)
     from the entry surface, and a black frame blocks the light that would miss the exit surface. ``irradiance`` is the
     irradiance at the centre of the entry surface.
 
-    The camera is halfway between slab and receiver, and casts no shadow. It sees a part of the receiver of width
-    ``receiver_width``, with x to the right and y down.
+    The camera is halfway between slab and receiver, and casts no shadow. The camera sees a part of the receiver whose
+    width is ``receiver_width``. In the image, x points to the right and y points down.
 
     The scene parameter ``lens.vertex_positions`` contains the vertices of the slab. The mesh attribute
-    ``vertex_weight`` is 1 at the vertices of the exit surface and 0 below, so that a height map can be applied to the
-    exit surface only. With ``two_surfaces``, the attribute ``vertex_entry_weight`` selects the vertices of the entry
-    surface.
+    ``vertex_weight`` is 1 at the vertices of the exit surface and 0 at all other vertices, so that a height map can be
+    applied to the exit surface only. With ``two_surfaces``, the attribute ``vertex_entry_weight`` is 1 at the vertices
+    of the entry surface and 0 at all other vertices.
     """
     high = rows / columns
     glass = {"type": "dielectric", "int_ior": eta, "ext_ior": 1.0}
@@ -69,7 +69,7 @@ def caustic_mirror(
     source_distance: float | None = None,
     irradiance: float = 3.0,
 ) -> SceneDict:
-    """Describe a mirror that reflects light onto a white receiver, on which it casts a caustic.
+    """Describe a mirror that reflects light onto a white receiver, where the light forms a caustic.
 
     The mirror has the width 1. It is in the plane z = 0 and faces +z. The function `sheet` creates the mesh for a
     height map of ``rows`` x ``columns``. Light arrives along (sin α, 0, -cos α), where α is ``angle`` in degrees. The
@@ -77,8 +77,8 @@ def caustic_mirror(
     ``irradiance`` is the irradiance at the centre of the mirror, on a plane perpendicular to the light.
 
     The receiver is parallel to the mirror, at z = ``distance``. A flat mirror would reflect the light that arrives at
-    the centre of the mirror to the centre of the receiver. The camera sees a part of the receiver of width
-    ``receiver_width``, with x to the right and y down.
+    the centre of the mirror to the centre of the receiver. The camera sees a part of the receiver whose width is
+    ``receiver_width``. In the image, x points to the right and y points down.
 
     The scene parameter ``mirror.vertex_positions`` contains the vertices of the mirror.
     """
@@ -91,8 +91,8 @@ def caustic_mirror(
     half = _half(rows, columns)
     if source_distance is not None:
         return scene | {"lamp": _point(-source_distance * along, along, half, 0.0, irradiance)}
-    # The beam is wider than the mirror, so that it also covers a displaced mirror. At this distance, the lamp does not
-    # block reflected light.
+    # The beam is wider than the mirror, so that the beam also covers a displaced mirror. The light source is so far
+    # away that it does not block reflected light.
     half = half * [np.cos(α), 1] + 0.1
     return scene | {"lamp": _collimated(-2 * _WIDTH / np.sin(α) * along, along, half, irradiance)}
 
@@ -123,9 +123,9 @@ def _observed(resolution: int, high: float, distance: float, receiver_width: flo
 
 
 def _half(rows: int, columns: int) -> Array:
-    """Return half of the width and half of the height of a surface, whose height map has the width 1.
+    """Return half of the width and half of the height of a surface with a height map of width 1.
 
-    The surface ends half a cell inside the map.
+    The surface ends half a cell inside the border of the height map.
     """
     return np.array([columns - 1, rows - 1]) / columns * _WIDTH / 2
 
@@ -133,7 +133,7 @@ def _half(rows: int, columns: int) -> Array:
 def _collimated(centre: Array, along: Array, half: Array, irradiance: float) -> SceneDict:
     """Describe a rectangle that emits light perpendicularly to its surface.
 
-    ``half`` contains half of its width and half of its height.
+    ``half`` contains half of the width and half of the height of the rectangle.
     """
     place = mi.ScalarTransform4f().look_at(origin=centre.tolist(), target=(centre + along).tolist(), up=[0, 1, 0])
     return {
@@ -163,7 +163,8 @@ def _point(origin: Array, axis: Array, half: Array, z: float, irradiance: float)
 def _frame(hole: Array, outer: Array, z: float) -> mi.Mesh:
     """Create a black frame in the plane z = const.
 
-    ``hole`` contains half of the width and half of the height of the hole, and ``outer`` those of the whole frame.
+    ``hole`` contains half of the width and half of the height of the hole. ``outer`` contains half of the width and
+    half of the height of the whole frame.
     """
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     vertices = np.concatenate([corners * hole, corners * outer])
@@ -175,8 +176,8 @@ def _frame(hole: Array, outer: Array, z: float) -> mi.Mesh:
 def _at_entry(r: float, s: float, eta: float) -> float:
     """Return the distance from the axis at which a ray from a point light enters the slab.
 
-    The point light is on the axis, at the distance ``s`` from the slab. The ray leaves the slab at the distance ``r``
-    from the axis.
+    The axis passes through the point light and is perpendicular to the slab. ``s`` is the distance from the light to
+    the slab. ``r`` is the distance from the axis at which the ray leaves the slab.
     """
     sine = np.linspace(0, 0.999, 10000)
     enters = s * sine / np.sqrt(1 - sine**2)
@@ -188,8 +189,8 @@ def sheet(rows: int, columns: int, width: float, bsdf: dict[str, object]) -> mi.
     """Create a rectangle that faces +z, for displacement by a height map of ``rows`` x ``columns``.
 
     The map has square cells and is centred at the origin of the plane z = 0. Its total width is ``width``. The
-    rectangle has a vertex at the centre of each cell, so it ends half a cell inside the map. Its texture coordinates
-    are the coordinates on the map, and it has vertex normals.
+    rectangle has a vertex at the centre of each cell, so the rectangle ends half a cell inside the border of the map.
+    The texture coordinates of the rectangle are the coordinates on the map. The rectangle has vertex normals.
 
     Raises PathreplayError if there are fewer than two rows or columns.
     """
@@ -201,12 +202,13 @@ def slab(
 ) -> mi.Mesh:
     """Create a closed slab whose upper face is a `sheet`, for displacement by a height map of ``rows`` x ``columns``.
 
-    The lower face and the sides are flat; they share positions with the upper face, but no vertices. With
-    ``two_surfaces``, the lower face has the vertices of the upper face, for displacement by a second map. Both maps
-    have the same texture coordinates.
+    The lower face and the sides are flat. The sides share positions with the two faces, but no vertices. With
+    ``two_surfaces``, the lower face has the same grid of vertices as the upper face, for displacement by a second map.
+    Both maps have the same texture coordinates.
 
-    The attribute ``vertex_weight`` is 1 at all vertices of the upper plane, and 0 below. With ``two_surfaces``, the
-    attribute ``vertex_entry_weight`` is 1 at all vertices of the lower plane, and 0 above.
+    The attribute ``vertex_weight`` is 1 at all vertices of the upper plane, and 0 at all other vertices. With
+    ``two_surfaces``, the attribute ``vertex_entry_weight`` is 1 at all vertices of the lower plane, and 0 at all other
+    vertices.
 
     Raises PathreplayError if there are fewer than two rows or columns.
     """

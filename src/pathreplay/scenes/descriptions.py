@@ -41,7 +41,7 @@ def errors_as(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -
     """Convert exceptions of the given ``kinds`` into a PathreplayError whose message begins with ``what``.
 
     The message quotes the first exception of the chain. Later exceptions, raised by Dr.Jit's calls and loops, are
-    uninformative. If the first exception is a KeyboardInterrupt (Ctrl-C), it is raised again instead.
+    uninformative. If the first exception is a KeyboardInterrupt (Ctrl-C), a KeyboardInterrupt is raised instead.
     """
     try:
         yield
@@ -59,7 +59,7 @@ def errors_as(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -
 def one_line(error: BaseException) -> str:
     """Convert a Mitsuba or Dr.Jit error to one readable line, without C++ source positions and Python tracebacks."""
     text = str(error)
-    if "PathreplayError: " in text:  # one of our plugins raised the error, and its message is written for users
+    if "PathreplayError: " in text:  # a plugin of this package raised the error, with a message for users
         return " ".join(text.rsplit("PathreplayError: ", 1)[1].split())
     text = re.sub(r"Traceback \(most recent call last\):\n(?:[ ]+.*\n)*", "", text)
     text = re.sub(r"\[[A-Za-z_]+\.cpp:\d+\] ", "", text)

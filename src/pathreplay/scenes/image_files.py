@@ -109,7 +109,7 @@ def size_of_picture(path: Path) -> tuple[int, int] | None:
 def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
     """Raise PathreplayError if an image has no pixels, has more than ``pixels`` pixels, or does not fit into memory.
 
-    The same error is raised for a damaged TGA, see `require_sound_tga`.
+    A damaged TGA file also raises PathreplayError; see `require_sound_tga`.
     """
     size = size_of_picture(path)
     if size is None:
@@ -124,7 +124,7 @@ def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
 
 
 def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
-    """Parse width and height; raises struct.error, ValueError or IndexError for a damaged header."""
+    """Parse width and height. Raises struct.error, ValueError or IndexError for a damaged header."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return struct.unpack_from(">II", data, 16)
     if data[:2] == b"\xff\xd8":
@@ -132,7 +132,7 @@ def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
     if data[:4] == b"\x76\x2f\x31\x01":
         return _exr_size(file)
     if data[:2] == b"BM":
-        old = struct.unpack_from("<I", data, 14)[0] == 12  # OS/2 header
+        old = struct.unpack_from("<I", data, 14)[0] == 12  # headers of this version (OS/2) have 16-bit sizes
         width, height = struct.unpack_from("<HH" if old else "<ii", data, 18)
         return abs(width), abs(height)
     if data[:2] in (b"P5", b"P6"):
@@ -166,7 +166,10 @@ def _jpeg_size(file: BinaryIO) -> tuple[int, int]:
 
 
 def _exr_size(file: BinaryIO) -> tuple[int, int]:
-    """Parse the size in the attribute ``dataWindow``; attributes consist of name, type, length of the value, value."""
+    """Parse the size in the attribute ``dataWindow``.
+
+    Each attribute consists of its name, its type, the length of its value, and the value.
+    """
     file.seek(8)
     for _ in range(_MOST_PARTS):
         name, kind = _text(file), _text(file)

@@ -48,10 +48,11 @@ def load_scene_with(
     /,
     **parameters: object,
 ) -> tuple[mi.Scene, list[str]]:
-    """Load a scene like `load_scene`, with some plugins replaced (``plugins``: old type -> new type).
+    """Load a scene like `load_scene`, with some plugins replaced. ``plugins`` maps old plugin types to new types.
 
-    ``spec`` may also be a dictionary. ``cameras`` are added to the sensors of the scene. For ``floats`` see
-    `load_file_with`. Returns the scene and one line per replaced plugin, with its id and position.
+    ``spec`` may also be a dictionary. ``cameras`` are added to the sensors of the scene. `load_file_with` describes
+    ``floats``. Returns the scene, and one line per replaced plugin. The line contains the id of the plugin, and its
+    position in the scene file.
     """
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
@@ -103,8 +104,8 @@ def load_scene_for(
     If a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded again with
     `dielectric_ad` in place of every ``dielectric``. If a pattern that ends in ``data`` matches an 8-bit texture, the
     scene is loaded again with floating-point texels for this texture. ``cameras`` are added to the sensors of the
-    scene. Returns the scene and a one-line note per kind of change. A pattern without a match causes no error here.
-    Raises the same errors as `load_scene`.
+    scene. Returns the scene and a one-line note for each kind of change. A pattern that matches no key causes no error
+    in this function. Raises the same errors as `load_scene`.
     """
     scene, _ = load_scene_with(spec, {}, base, cameras, **parameters)
     params = traversed(scene)
@@ -114,7 +115,7 @@ def load_scene_for(
     if not plugins and not floats:
         return scene, ()
     # Dr.Jit traces virtual calls through every live instance. The first scene must therefore be freed before the second
-    # is loaded.
+    # scene is loaded.
     del scene, params
     gc.collect()
     scene, exchanged = load_scene_with(spec, plugins, base, cameras, floats, **parameters)
@@ -138,14 +139,17 @@ def load_scene_with_floats(
 
 
 def coarse_pictures(params: mi.SceneParameters, wanted: Iterable[str]) -> tuple[str, ...]:
-    """Return the image files of 8-bit textures that match a pattern in ``wanted`` whose last part is ``data``."""
+    """Return the image files of 8-bit textures whose texels match a pattern in ``wanted``.
+
+    Only patterns whose last part is ``data`` are used.
+    """
     owners = [params.properties[key][2] for key in _matching(params, wanted, "data")]
     matches = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
     return tuple(dict.fromkeys(match[1] for match in matches if match))
 
 
 def _matching(params: mi.SceneParameters, wanted: Iterable[str], name: str) -> list[str]:
-    """Return the keys that match a pattern in ``wanted`` whose last part is ``name``."""
+    """Return the keys that match a pattern in ``wanted``. Only patterns whose last part is ``name`` are used."""
     keys: list[str] = []
     for pattern in wanted:
         if pattern.rsplit(".", 1)[-1] == name:

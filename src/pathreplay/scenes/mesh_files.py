@@ -33,7 +33,10 @@ class _Element:
         return [kinds[0] for kinds in self.properties]
 
     def layout(self, form: str) -> np.dtype[np.void]:
-        """Return the NumPy type of one vertex or face. Lists must have three items. Numbers in text are float64."""
+        """Return the NumPy type of one vertex or face. Lists must have three items.
+
+        All numbers of an ASCII file have the type float64.
+        """
         order = "<" if form == "binary_little_endian" else ">"
         fields: list[tuple[str, str] | tuple[str, str, int]] = []
         for i, (*kinds, _) in enumerate(self.properties):
@@ -61,7 +64,7 @@ def require_sound_ply(path: Path) -> None:
         try:
             indices = _triangles(file, elements, form)
         except (KeyError, ValueError, IndexError):
-            return  # Mitsuba may support this file although this reader does not
+            return  # Mitsuba may be able to read this file, although the function `_triangles` is not
     if indices is not None:
         _require_vertices(path, indices, vertices)
 
@@ -84,7 +87,7 @@ def _ply_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:
 def _triangles(file: BinaryIO, elements: list[_Element], form: str) -> np.ndarray | None:
     """Read the vertex indices (n, 3). Return None if data are missing or a face is not a triangle.
 
-    Mitsuba rejects such files.
+    Mitsuba rejects files with these defects.
     """
     vertex, face = (element.layout(form) for element in elements[:2])
     with warnings.catch_warnings():
@@ -99,7 +102,8 @@ def _triangles(file: BinaryIO, elements: list[_Element], form: str) -> np.ndarra
     return entries[f"{at}"] if (entries[f"count {at}"] == 3).all() else None
 
 
-# First bytes of a serialized mesh file (version 3 or 4) -> bytes per entry of the table of shapes at its end.
+# Maps the first bytes of a serialized mesh file (version 3 or 4) to the size in bytes of an entry of the table of
+# shapes, which is at the end of the file.
 _ENTRIES = {b"\x1c\x04\x03\0": 4, b"\x1c\x04\x04\0": 8}
 
 
@@ -120,7 +124,8 @@ def require_sound_serialized(path: Path, index: object) -> None:
             f"Mesh {path} of {size} bytes should contain {count} shapes; it is damaged, write it again"
         )
     try:
-        # With face normals, Mitsuba does not compute vertex normals. That computation would use the unchecked indices.
+        # With face normals, Mitsuba does not compute vertex normals. To compute them, Mitsuba would use the unchecked
+        # indices.
         description = {"type": "serialized", "filename": str(path), "shape_index": index, "face_normals": True}
         mesh = mi.load_dict(description)
     except RuntimeError:

@@ -1,4 +1,4 @@
-"""Validate the headers of a NanoVDB file, because the reader crashes on damaged headers.
+"""Validate the headers of a NanoVDB file, because the library that reads the file crashes on damaged headers.
 
 A file is a sequence of segments. A segment consists of a header of 16 bytes (magic, version, number of grids,
 compression), a description of every grid (176 bytes and a name), and the grids. A grid begins with a header of 672
@@ -24,12 +24,13 @@ NONE, ZIP = 0, 1
 _MOST_PACKED = 1032
 
 _SEGMENT = struct.Struct("<8sIHH")
-# Size in memory, size in the file, hash of the name, number of voxels, type, class, and length of the name. Two boxes
-# and the voxel size precede the length of the name and are skipped.
+# The description of a grid: size in memory, size in the file, hash of the name, number of voxels, type of the values,
+# class of the grid, and length of the name. Two boxes and the voxel size precede the length of the name. They are
+# skipped.
 _GRID = struct.Struct("<4Q2I96xI36x")
 _GRID_HEADER = 672
-# Offsets of leaves, lower nodes, upper nodes and root, relative to the position of this structure, and the numbers of
-# leaves, lower nodes and upper nodes.
+# The positions of the tree nodes: four offsets (leaves, lower nodes, upper nodes, root) relative to the start of this
+# structure, then three counts (leaves, lower nodes, upper nodes).
 _TREE = struct.Struct("<4Q3I")
 _FLOAT, _FLOAT_SIZES = 1, (2144, 33856, 270400)
 

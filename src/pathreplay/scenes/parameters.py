@@ -1,4 +1,4 @@
-"""Scene parameters by key: find them, report which are differentiable, and convert them to and from NumPy.
+"""Find scene parameters by key, report which parameters are differentiable, and convert parameters to and from NumPy.
 
 A parameter is addressed by its key in ``mi.traverse(scene)``. Conversion to NumPy and back preserves types: ``Float``,
 ``Color3f`` and similar types, ``TensorXf`` (textures, grids) and ``AffineTransform4f``.
@@ -62,7 +62,7 @@ def resolve_keys(params: Mapping[str, object], patterns: str | Iterable[str]) ->
     known = list(params.keys())
     selected: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        # '[[]' matches a literal '['.
+        # In a glob, '[[]' matches the character '['.
         literal = pattern.replace("[", "[[]")
         matches = [pattern] if pattern in known else fnmatch.filter(known, pattern) or fnmatch.filter(known, literal)
         if not matches:
@@ -96,7 +96,7 @@ def owner_class(params: mi.SceneParameters, key: str) -> str:
 def require_differentiable(params: mi.SceneParameters, key: str, integrator: mi.Integrator | None = None) -> None:
     """Raise PathreplayError unless ``integrator`` can differentiate the parameter ``key``.
 
-    If ``integrator`` is None, the integrators of Mitsuba must be able to differentiate it.
+    If ``integrator`` is None, Mitsuba's own integrators must be able to differentiate the parameter.
 
     The error is raised for missing keys, plain numbers, integers, empty arrays, and most parameters with the flag
     ``mi.ParamFlags.NonDifferentiable`` (see `carries_derivative`). The message names a remedy if there is one.
@@ -157,9 +157,10 @@ def resolve_differentiable(
 def carries_derivative(params: mi.SceneParameters, key: str, integrator: mi.Integrator | None = None) -> bool:
     """Return whether a parameter is differentiable.
 
-    Differentiable parameters are non-empty Dr.Jit float arrays without the flag ``mi.ParamFlags.NonDifferentiable``.
-    Parameters of cameras, and parameters that move emitters, have this flag. The integrator ``pathreplay``
-    differentiates them nevertheless, unless its ``attach`` is 'none'.
+    A differentiable parameter is a non-empty Dr.Jit float array. For most integrators, it must not have the flag
+    ``mi.ParamFlags.NonDifferentiable``. Mitsuba sets this flag for parameters of cameras and for parameters that move
+    emitters. The integrator ``pathreplay`` differentiates such parameters nevertheless, unless its ``attach`` is
+    'none'.
     """
     if not _is_float(params[key]) or is_empty(params[key]):
         return False
@@ -176,9 +177,10 @@ _LIGHT = {"to_world", "position"}
 
 
 def needs_ray_adjoint(params: mi.SceneParameters, key: str) -> bool:
-    """Return whether a parameter belongs to a camera, or moves an emitter without a shape.
+    """Return whether a parameter belongs to a camera, or moves an emitter that has no shape.
 
-    The derivatives of these parameters depend on the adjoints of rays, which Mitsuba's integrators do not compute.
+    To differentiate such a parameter, an integrator needs the adjoints of rays. Mitsuba's integrators do not compute
+    them.
     """
     node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
     placed = (isinstance(node, mi.Sensor) and name in _CAMERA) or (isinstance(node, mi.Emitter) and name in _LIGHT)
@@ -203,14 +205,14 @@ def _is_float(value: object) -> bool:
 
 
 def is_empty(value: object) -> bool:
-    """Return whether an array has no entries, for example the texture coordinates of a mesh that has none."""
+    """Return whether an array has no entries, for example if a mesh has no texture coordinates."""
     return 0 in dr.shape(_array(value))
 
 
 def require_finite(params: mi.SceneParameters) -> None:
     """Raise PathreplayError, which names key and index, if a parameter contains NaN or infinite values.
 
-    Plain numbers, for example distances, may be infinite. The cost is one reduction per array.
+    Plain numbers, for example distances, may be infinite. The check costs one reduction per array.
     """
     counts: dict[str, mi.UInt32] = {}
     for key in params.keys():
@@ -234,8 +236,8 @@ def require_finite(params: mi.SceneParameters) -> None:
 def get_array(value: SceneValue | float) -> np.ndarray:
     """Copy the value of a floating-point parameter to a NumPy array of the same precision, without derivatives.
 
-    The shape is (1,) for a plain number, (n,) for ``Float``, and (4, 4) for ``AffineTransform4f``. A single ``Color3f``
-    has the shape (3,), and n colours have the shape (3, n). A ``TensorXf`` has its own shape.
+    The result has the shape (1,) for a plain number, (n,) for ``Float``, and (4, 4) for ``AffineTransform4f``. A single
+    ``Color3f`` gives the shape (3,), and n colours give the shape (3, n). The shape of a ``TensorXf`` is kept.
     """
     if isinstance(value, float):
         return np.array([value], np.float32)

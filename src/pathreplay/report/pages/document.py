@@ -1,4 +1,7 @@
-"""Renders a page as one HTML document with inline style and script; its CSP forbids requests to other hosts."""
+"""Renders a page as one HTML document with inline style and script.
+
+The Content-Security-Policy of the document forbids requests to other hosts.
+"""
 
 from __future__ import annotations
 

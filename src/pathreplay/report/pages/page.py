@@ -47,7 +47,7 @@ class View:
 
 @dataclass(frozen=True)
 class Row:
-    """A table row: its name, its cells, and a colour swatch (#rrggbb) or ""."""
+    """A table row, which consists of a name, cells, and a colour swatch (#rrggbb, or "" for none)."""
 
     name: str
     cells: tuple[str, ...]
@@ -159,6 +159,9 @@ class Page:
 
 
 def thinned(count: int, most: int = MOST_POINTS) -> list[int]:
-    """Return the indices of the points to draw: all, or about ``most`` evenly spaced ones and the last."""
+    """Return the indices of the points of a curve to draw.
+
+    If there are more than ``most`` points, about ``most`` evenly spaced points and the last point are drawn.
+    """
     step = -(-count // most) or 1
     return [*range(0, count - 1, step), count - 1] if count else []

@@ -1,6 +1,6 @@
 """Compares runs. A table shows the results of the runs and the differences between their jobs.
 
-A page shows this table with curves and images.
+A page shows this table, curves and images.
 """
 
 from __future__ import annotations

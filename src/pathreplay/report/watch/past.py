@@ -22,19 +22,22 @@ _HISTORY = TypeAdapter(list[Entry])
 
 @dataclass(frozen=True)
 class Past:
-    """A run in a folder. ``name`` differs from the names of the other inspected runs."""
+    """A run in a folder. ``name`` is unique among the runs that a command inspects."""
 
     folder: Path
     name: str
 
     @cached_property
     def config(self) -> Config:
-        """Config of the job. Raises PathreplayError if the config cannot be read."""
+        """The config of the job. Raises PathreplayError if the config cannot be read."""
         return read_job(self.folder).config
 
     @cached_property
     def history(self) -> list[Entry]:
-        """Iterations up to the last checkpoint. Raises PathreplayError if the checkpoint is missing or damaged."""
+        """The iterations up to the last checkpoint.
+
+        Raises PathreplayError if the checkpoint is missing or damaged.
+        """
         path = self.folder / CHECKPOINT
         try:
             with safetensors.safe_open(str(path), framework="numpy") as file:
@@ -47,7 +50,7 @@ class Past:
 
     @cached_property
     def views(self) -> dict[str, Json]:
-        """Entries of views.json by view name; empty before the end of the run."""
+        """The entries of views.json by view name. The dictionary is empty before the end of the run."""
         table = self._json("views.json")
         return table if all(isinstance(view, dict) for view in table.values()) else {}
 

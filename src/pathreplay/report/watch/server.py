@@ -38,7 +38,7 @@ MOST = 32
 
 
 class RunServer(ThreadingHTTPServer):
-    """Serves a run at ``address``, which is a URL with a token, until `shutdown`."""
+    """Serves a run until `shutdown` is called. ``address`` is the URL of the server, which contains a token."""
 
     daemon_threads = True
     request_queue_size = MOST
@@ -63,14 +63,14 @@ class RunServer(ThreadingHTTPServer):
         self.address = f"http://{shown}:{self.server_address[1]}/{self.token}/"
 
     def process_request(self, request: Request, client_address: object) -> None:
-        """Answer in a new thread, or close the connection if there are too many connections."""
+        """Answer a request in a new thread, or close the connection if there are too many connections."""
         if not self.room.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Request, client_address: object) -> None:
-        """Answer, and then release the slot of the connection."""
+        """Answer a request, and then release the slot of the connection."""
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -103,11 +103,11 @@ class _Within(io.RawIOBase):
         self.connection, self.end = connection, time.monotonic() + seconds
 
     def readable(self) -> bool:
-        """Return True."""
+        """Return True, as `io.BufferedReader` requires."""
         return True
 
     def readinto(self, buffer: WriteableBuffer) -> int:
-        """Read bytes. Raises TimeoutError after the deadline."""
+        """Read bytes from the client into ``buffer``. Raises TimeoutError after the deadline."""
         if (left := self.end - time.monotonic()) <= 0:
             raise TimeoutError
         self.connection.settimeout(left)
@@ -165,7 +165,10 @@ class Handler(BaseHTTPRequestHandler):
         return False
 
     def _place(self) -> str | None:
-        """Return the requested path after the token. If the request must be refused, answer it and return None."""
+        """Return the part of the requested path after the token.
+
+        If the request must be refused, send an error to the client, and return None.
+        """
         if not self.server.knows(self.headers.get("Host", "")):
             self._answer(403, "text/plain", b"unknown host name\n")
             return None

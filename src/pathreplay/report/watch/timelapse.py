@@ -1,4 +1,4 @@
-"""Makes a film of a run as WebP or MP4, whose frames show the target beside the image of one iteration."""
+"""Makes a film of a run as WebP or MP4. Each frame shows the target beside the image of one iteration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pathreplay.report.watch.run_files import read_own
 
 # Height of the images, and of the line of text below the images, in pixels.
 HEIGHT, TEXT = 288, 24
-# Maximum number of textures and volumes beside the view.
+# Maximum number of textures and volumes that are shown beside the view.
 MOST_BESIDE = 2
 KINDS = (".webp", ".mp4")
 
@@ -82,8 +82,8 @@ def _pictures(run: Path, view: str | None) -> list[PIL.Image.Image]:
         now = {"target": target, f"after {i} iterations": _opened(by_what[f"view-{chosen}"][i])}
         now |= {what.split("-", 1)[1]: _opened(by_what[what][i]) for what in beside}
         sheets.append(now)
-    # If a grid was refined during the run, the resolution of its frames varies. The sizes in the last frame are used
-    # for all frames.
+    # If a texture or volume was refined during the run, the resolution of its images varies. The sizes of the images in
+    # the last frame are used for all frames.
     sizes = [(max(2, round(p.width * HEIGHT / p.height)), HEIGHT) for p in sheets[-1].values()]
     return [_side_by_side(now, sizes) for now in sheets]
 
@@ -97,7 +97,8 @@ def _side_by_side(pictures: Mapping[str, PIL.Image.Image], sizes: list[tuple[int
     sheet = PIL.Image.new("RGB", (width + width % 2, HEIGHT + TEXT), (20, 23, 27))
     draw, font, x = PIL.ImageDraw.Draw(sheet), PIL.ImageFont.load_default(14), 0
     for (name, picture), size in zip(pictures.items(), sizes, strict=True):
-        # Enlarge without interpolation, so that texels stay square, and reduce by averaging.
+        # Small images are enlarged without interpolation, so that texels stay square. Large images are reduced by
+        # averaging.
         kind = PIL.Image.Resampling.NEAREST if picture.height <= HEIGHT else PIL.Image.Resampling.BOX
         sheet.paste(picture.resize(size, kind), (x, 0))
         draw.text((x + 4, HEIGHT + 3), name[: max(4, size[0] // 8)], fill=(231, 234, 238), font=font)
