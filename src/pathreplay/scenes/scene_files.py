@@ -85,7 +85,7 @@ def require_sound_files(state: mi.parser.ParserState) -> None:
         elif kind == "gridvolume":
             require_whole_vol(path)
         elif kind in ("bitmap", "envmap"):
-            require_readable_picture(path, pixels=2**31)  # in practice, memory limits the size
+            require_readable_picture(path, pixels=2**31)  # in practice, available memory limits the number of pixels
         elif kind == "serialized":
             require_sound_serialized(path, node.props.get("shape_index", 0))
 

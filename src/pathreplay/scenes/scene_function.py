@@ -67,7 +67,7 @@ class SceneFunction:
         self._forms = {key: form_of(self.params, key) for key in self.keys}
         seen = {key: self._forms[key].see(self.params[key]) for key in self.keys}
         self._types = {key: type(value) for key, value in seen.items()}
-        # Copies, because calls of this object change the scene.
+        # The values are copied, because calls of this object change the scene.
         self._start = {key: get_array(value).copy() for key, value in seen.items()}
 
     def require(self, shapes: Mapping[str, tuple[int, ...]]) -> None:

@@ -2,9 +2,9 @@
 
 In spectral variants, a colour is a smooth spectrum S(p(λ)), with S(p) = 1/2 + p / (2 √(1 + p²)), p(λ) = c_0 λ² + c_1 λ
 + c_2, and λ in nm. Mitsuba stores c_0, c_1 and c_2. For environment maps and grids, the fourth channel is a factor. A
-step of 0.01 in c_0 changes p by thousands, and the same step in c_2 changes p by almost nothing. Optimisers therefore
-take steps in the values of p or S at three wavelengths. The values of p are a constant matrix times c. The reflectance
-S is nearly linear in the values of p for colours of low saturation.
+step of 0.01 in c_0 changes p by thousands, and a step of 0.01 in c_2 changes p by almost nothing. Optimisers therefore
+take steps in the values of p or S at three wavelengths. These three values of p are a constant matrix times the vector
+c = (c_0, c_1, c_2). For colours of low saturation, the reflectance S is nearly linear in the values of p.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def coefficients(p: np.ndarray) -> np.ndarray:
 
 
 def values_of_p(c: np.ndarray) -> np.ndarray:
-    """Compute the values of p at `WAVELENGTHS` from the coefficients; the inverse of `coefficients`."""
+    """Compute the values of p at `WAVELENGTHS` from the coefficients. Inverse of the function `coefficients`."""
     return np.concatenate([c[..., :3] @ np.vander(WAVELENGTHS).T, c[..., 3:]], axis=-1)
 
 

@@ -3,8 +3,8 @@
 ============================  ======================================  =================================================
 parameter                     stored by Mitsuba                       decoded value
 ============================  ======================================  =================================================
-``data`` of an ``envmap``     an additional column on both sides,     the columns of the image; in mono variants one
-                              equal to the column of the other end;   channel
+``data`` of an ``envmap``     one more column at each end, a copy of  the columns of the image; in mono variants one
+                              the column at the opposite end;         channel
                               in mono variants three equal channels
 textures of 16 bits           half precision                          single precision
 colours in spectral variants  coefficients of a smooth spectrum S     S at a red, a green and a blue wavelength; in
@@ -32,8 +32,8 @@ from pathreplay.scenes.spectra import TO_COEFFICIENTS, WAVELENGTHS, coefficient_
 
 Array = NDArray[np.float32]
 
-# Distance that `Spectra.store` keeps from the limits 0 and 1 of a spectrum S, where the polynomial p is infinite (see
-# `spectra`).
+# Distance that `Spectra.store` keeps between the values of a spectrum S and their limits 0 and 1. At these limits, the
+# polynomial p is infinite (see `spectra`).
 _MARGIN = 1e-4
 
 
@@ -118,7 +118,8 @@ class Spectra(Form):
 
     def store(self, seen: SceneValue) -> SceneValue:
         S = mi.Vector3f(*_entries(seen, 3))
-        # As in Mitsuba, the largest entry is scaled to one half, because spectra with moderate values are smooth.
+        # As in Mitsuba, S is scaled so that its largest entry is one half, because spectra with moderate values are
+        # smooth.
         factor = dr.maximum(2 * dr.max(S), 1e-8) if self.scaled else mi.Float(1)
         x = 2 * dr.clip(S / factor, _MARGIN, 1 - _MARGIN) - 1
         p = x * dr.rsqrt(1 - dr.square(x))

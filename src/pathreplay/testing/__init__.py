@@ -1,4 +1,4 @@
-"""Independent estimates of a gradient, and a verdict on it."""
+"""Gradient checks: compare a gradient with finite differences, and give a verdict on the gradient."""
 
 from pathreplay.testing.gradient import GradientCheck, check_gradient
 from pathreplay.testing.picture import DerivativeImages, derivative_images

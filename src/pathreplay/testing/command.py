@@ -126,9 +126,9 @@ def pictured(
     boundary: Mapping[str, object] | None = None,
     **options: Any,
 ) -> list[tuple[str, str, np.ndarray, np.ndarray]]:
-    """Return key, integrator, derivative image and finite differences of each parameter, with progress on stderr.
+    """Return the key, the integrator's name, the derivative image and the finite differences of each parameter.
 
-    Raises the same errors as :func:`derivative_images`.
+    Progress is shown on standard error. Raises the same errors as :func:`derivative_images`.
     """
     tested = integrator_under_test(integrator, scene, max_depth, boundary)
     rows = []

@@ -24,7 +24,7 @@ RELATIVE_STEP = 1e-2
 """Step h relative to the size of the parameter. The relative error of finite differences is then about 1e-4 from
 truncation (proportional to h²), and about 1e-5 from the float32 rounding of images."""
 
-# Parameters that may be negative. All other parameters without negative entries are treated as bounded by 0.
+# Parameters that may be negative. All other parameters are treated as non-negative if they have no negative entry.
 _SIGNED = (*compat.POSITIONS, *compat.NORMALS, *compat.TEXCOORDS, "to_world", "to_uv", "position", "direction")
 
 
@@ -58,8 +58,8 @@ def choose_line(
     """Choose the line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
 
     By default, the step is a hundredth of the parameter's size (see `Line`). The differences are one-sided if a step
-    would make a non-negative parameter negative, for example a black texel, because negative roughness or density is
-    invalid.
+    would make an entry of a non-negative parameter negative. This happens, for example, at a black texel. A negative
+    roughness or density would be invalid.
 
     The random direction of a transform is a translation. If ``far``, the transform belongs to an infinitely distant
     emitter (sun, sky), which translation does not change. The random direction is then a rotation about a random axis.
@@ -95,12 +95,12 @@ def choose_line(
     return Line(value, v, description, size, float(step), _choose_stencil(key, value, v * step))
 
 
-# Largest step relative to the size of the parameter: larger changes give a different scene.
+# Largest step relative to the size of the parameter. A longer step would change the scene entirely.
 _LONGEST_STEP = 1e6
 
 
 def _require_seen(key: str, value: np.ndarray, direction: np.ndarray, step: float, size: float) -> None:
-    """Raise PathreplayError for a step that is far larger than the parameter, or that rounds away in float32."""
+    """Raise PathreplayError for a step that is far larger than the parameter, or too small to change it in float32."""
     remedy = f"leave it out, or give one near {RELATIVE_STEP * size:g}"
     if step * float(np.abs(direction).max()) > _LONGEST_STEP * size:
         raise PathreplayError(f"Step {step} for '{key}' is too long for values up to {size:g}; {remedy}")
@@ -140,6 +140,7 @@ def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
             return FORWARD
         if (value - 2 * move >= 0).all():
             return BACKWARD
-    # Both one-sided stencils may reach negative values, too: for example, if the parameter has zeros and a given
-    # direction has mixed signs. Central differences are used then, which are harmless if the image is linear there.
+    # Both one-sided stencils may also reach negative values, for example if the parameter has zeros and a given
+    # direction has mixed signs. Central differences are then used. Negative values are harmless if the image is linear
+    # in the parameter near zero.
     return CENTRAL

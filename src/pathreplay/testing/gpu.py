@@ -130,7 +130,7 @@ def truth(name: str) -> Json:
 
 
 def timing(name: str) -> Json:
-    """Time gradient passes: return seconds of the first pass, and median and minimum of the others."""
+    """Time gradient passes: return the seconds of the first pass, and the median and minimum of the later passes."""
     import drjit as dr
     import mitsuba as mi
 
@@ -160,7 +160,8 @@ def main(variant: str, name: str) -> None:
     kind, _, what = name.partition(": ")
     facts = truth(what) if kind == "truth" else timing(what)
     print(json.dumps({"facts": facts}), flush=True)
-    os._exit(0)  # skip process shutdown: an error of the GPU driver there would count as a failure of the item
+    # Skip the shutdown of the process. An error of the GPU driver during shutdown would count as a failure of the item.
+    os._exit(0)
 
 
 if __name__ == "__main__":

@@ -155,8 +155,8 @@ class _Plan:
     ) -> GradientCheck:
         n, stencil = self.seeds, line.stencil
         self._tell()
-        # 32-bit seeds. Each gradient has a seed for its primal image and one for its derivative pass. The reference and
-        # the weights have seeds, too.
+        # All seeds have 32 bits. Each of the n gradients has one seed for its primal image and one for its derivative
+        # pass. The reference has n seeds, and the weights have one seed.
         words = [int(word) for word in np.random.SeedSequence(self.seed).generate_state(3 * n + 1)]
         objective.weigh_by(loss, plain, words[-1], self.fd_spp)
         self._tick()

@@ -1,8 +1,8 @@
-"""The objective of a check: a weighted mean F of the image, as a function of one scalar parameter π.
+"""The objective of a check: a weighted mean F of the image, as a function of one scalar t that moves a parameter.
 
-Let I_k be the n values of the image, and w_k their weights. The objective F(π) = Σ_k w_k I_k(π) / n is
-linear in the image. The gradient of one noisy image is therefore an unbiased sample of the gradient of F, and the
-difference of two noisy images is an unbiased sample of a difference of F.
+Let I_k be the n values of the image, and w_k their weights. The objective F(t) = Σ_k w_k I_k(t) / n is linear in the
+image. The gradient of one noisy image is therefore an unbiased sample of the gradient of F, and the difference of two
+noisy images is an unbiased sample of a difference of F.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Loss = Callable[["mi.TensorXf"], "mi.Float"]
 
 @contextmanager
 def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
-    """Detach all parameters, so that only ``key`` will be attached; restore everything at the end."""
+    """Detach all parameters, so that the caller can attach ``key`` alone. Restore all parameters at the end."""
     # Copy the values, because `params` returns references into the scene, whose values are about to change.
     held = {name: dr.copy(params[name]) for name in params.keys() if name == key or dr.grad_enabled(params[name])}
     # Set values through `params`, followed by update(), because objects cache values derived from their parameters.
@@ -67,7 +67,7 @@ class Objective:
         self.params.update()
 
     def weigh(self, weights: np.ndarray) -> None:
-        """Set the weights w / n, in the shape of the image."""
+        """Set the weights w_k / n of the n values of the image. ``weights`` has the shape of the image."""
         self.adjoint = mi.TensorXf(weights)
         self.weights = np.array(self.adjoint, np.float64)
 
@@ -146,13 +146,13 @@ class Objective:
         return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
 
     def collect(self, t: mi.Float) -> float:
-        """Propagate gradients from the parameter, where a reverse pass accumulated them, back to t."""
+        """Propagate the gradient that a reverse pass accumulated at the parameter back to t. Return dF/dt."""
         dr.enqueue(dr.ADMode.Backward, self.params[self.key])
         dr.traverse(dr.ADMode.Backward)
         return float(dr.grad(t)[0])
 
     def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
-        """Judge gradients by finite differences: ``full`` with the step of the line, ``half`` with half this step."""
+        """Judge gradients by finite differences: ``full`` with the step of the line, ``half`` with half of the step."""
         # Worst case: every value of every image has a rounding error of half a unit in the last place, and all these
         # errors have the same sign.
         unit = np.finfo(get_array(self.value).dtype).eps / 2
@@ -176,11 +176,12 @@ def _has_alpha(sensor: mi.Sensor) -> bool:
 
 
 def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
-    """Return w / n with w = 1 + cos(2π (0.7 x + 0.4 y + c/3)) / 2 for pixel (x, y) in [0, 1]² and channel c.
+    """Return the weights w / n, with n the number of values of the image.
 
-    The weights are positive and smooth, because random signs would reduce the signal (see `direction`). The wave runs
-    obliquely across the image and is out of phase between channels. Otherwise, a mirror symmetry of the scene could
-    make the weighted mean constant.
+    At the pixel (x, y) in [0, 1]², channel c has the weight w = 1 + cos(2π (0.7 x + 0.4 y + c/3)) / 2. The weights
+    are positive and smooth, because random signs would reduce the signal (see `direction`). The wave runs obliquely
+    across the image and is out of phase between channels. Otherwise, a mirror symmetry of the scene could make the
+    weighted mean constant.
     """
     height, width, channels = shape
     y, x, c = np.ogrid[:height, :width, :channels]

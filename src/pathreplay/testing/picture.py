@@ -51,15 +51,15 @@ def derivative_images(  # noqa: PLR0913 (all but two are keyword-only)
         reference: the integrator whose images are differenced: see :func:`check_gradient`.
         max_depth: path length, if ``integrator`` is None or a name.
         sensor: index of the sensor.
-        seeds: number of forward passes, and of differences, that are averaged.
+        seeds: number of forward passes in the mean, and number of finite differences in the mean.
         spp: samples per pixel of a forward pass.
-        fd_spp: samples per pixel of one image of a difference (None: ``spp``).
+        fd_spp: samples per pixel of each image from which differences are computed (None: ``spp``).
         step: step of the differences: see :func:`check_gradient`.
         direction: direction of the parameter: see :func:`check_gradient`.
         seed: determines all random numbers and the direction.
 
     Returns:
-        Both images.
+        The mean derivative image of the forward passes, and the mean image of the finite differences.
 
     The forward derivative lacks the terms that the integrator omits. The integrator must support forward mode, which
     some integrators of Mitsuba do not.

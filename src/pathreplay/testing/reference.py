@@ -1,7 +1,7 @@
 """The two integrators of a check: the integrator under test, and the plain path tracer used as its reference.
 
-The reference must estimate the same image: same path length, same treatment of directly visible emitters. These
-settings are read from the integrator under test.
+The reference must estimate the same image as the integrator under test. Both therefore need the same path length, and
+must treat directly visible emitters alike. These settings are read from the integrator under test.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ def integrator_under_test(
 def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> mi.Integrator:
     """Return the integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
 
-    Russian roulette is disabled if paths are short enough. This does not change the expected image. Without roulette,
-    no decision to end a path differs between +h and -h. Roulette also cannot handle negative throughputs, which occur
-    if -h makes a reflectance negative.
+    Russian roulette is disabled if ``max_depth`` is bounded by `LONGEST_WITHOUT_ROULETTE`. The expected image does
+    not change. With roulette, a path could end at +h and continue at -h. Roulette also cannot handle negative
+    throughputs, which occur if -h makes a reflectance negative.
 
     Raises PathreplayError if the path length of the tested integrator cannot be read, or ``spec`` cannot be created.
     """

@@ -1,8 +1,8 @@
 """Statistics of small samples: means with standard errors, and differences of means as normal deviates.
 
-Standard errors are estimated from the samples. A difference divided by its error therefore follows Student's
-distribution. ``z`` is the normal deviate with the same tail probability as this ratio, so that |z| < 4 means the same
-for 3 seeds as for 300. All functions take numbers or arrays; samples are along the first axis.
+Standard errors are estimated from the samples. The ratio of a difference and its error therefore follows Student's
+distribution. ``z`` is the normal deviate with the same tail probability as this ratio. The condition |z| < 4 is thus
+equally strict for 3 and for 300 seeds. All functions take numbers or arrays; samples are along the first axis.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def mean_and_error(samples: ArrayLike) -> tuple[Numbers, Numbers]:
 
 
 def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
-    """Compare the means of independent samples (n, ...) and (m, ...). Without a sample axis, ``b`` is exact."""
+    """Compare the means of samples of shapes (n, ...) and (m, ...). If ``b`` has no sample axis, ``b`` is exact."""
     a, b = np.asarray(a), np.asarray(b)
     known = b.ndim < a.ndim
     (mean_a, error_a), (mean_b, error_b) = mean_and_error(a), (b, 0) if known else mean_and_error(b)

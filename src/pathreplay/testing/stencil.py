@@ -27,7 +27,7 @@ class Stencil:
         return tuple(sorted({o for o, _ in self.terms + self.halved().terms}))
 
     def rounding(self) -> float:
-        """Return the worst-case amplification of errors of f by (4 D(h/2) - D(h)) / 3, in units of 1/h."""
+        """Return the largest factor, in units of 1/h, by which (4 D(h/2) - D(h)) / 3 amplifies errors of f."""
         full, half = dict(self.terms), dict(self.halved().terms)
         return sum(abs(4 * half.get(o, 0) - full.get(o, 0)) for o in self.points()) / 3
 

@@ -41,9 +41,9 @@ SUMMATION = 1e-4
 
 @dataclass(frozen=True)
 class Judgement:
-    """The result of a comparison.
+    """The result of the comparison of a gradient with finite differences.
 
-    All numbers except z and resolution are derivatives of the objective along the direction.
+    All numbers except z and resolution are derivatives of the objective along the checked direction, or their errors.
     """
 
     gradient: float
@@ -62,16 +62,17 @@ class Judgement:
 def judge(
     gradient: np.ndarray, full_step: np.ndarray, half_step: np.ndarray, *, rounding: float = 0, negligible: float = 0
 ) -> Judgement:
-    """Compare n gradient samples with n finite differences of step h and n of step h/2 (same seeds for these two).
+    """Compare n gradient samples with n finite differences of step h and n finite differences of step h/2.
 
-    ``rounding`` bounds the error of floating-point arithmetic in the reference; ``negligible`` is the size below which
-    a derivative counts as zero. Shapes (n,), n >= 2.
+    All arrays have the shape (n,), with n >= 2. The finite differences of both steps have the same seeds.
+    ``rounding`` bounds the error of floating-point arithmetic in the reference. ``negligible`` is the size below which
+    a derivative counts as zero.
 
-    Rule: the gradient *fails* if |z| >= 4 or if it is not finite. Otherwise it *passes* if σ is at most a tenth of the
-    larger mean. Otherwise it passes as *zero* if both means are within 4 σ of zero and 4 σ is negligible. Otherwise
-    the noise is too large and the check is *inconclusive*.
+    The gradient *fails* if |z| >= 4 or if it is not finite. Otherwise it *passes* if σ is at most a tenth of the
+    larger mean. Otherwise it passes as *zero* if both means are within 4 σ of zero and 4 σ is at most ``negligible``.
+    Otherwise the noise is too large and the check is *inconclusive*.
     """
-    with np.errstate(invalid="ignore"):  # samples that are infinite get a verdict below
+    with np.errstate(invalid="ignore"):  # samples that are NaN or infinite are handled below
         reference = (4 * half_step - full_step) / 3
         # The error of D(h/2) is a third of the change caused by halving the step. This error is a conservative bound
         # for the extrapolation, which is more accurate.

@@ -1,1 +1,1 @@
-"""The differentiable step of a path at one vertex: arrival, next-event estimation, scattering, and motion."""
+"""The differentiable step of a path at one vertex: arrival, next-event estimation and scattering."""

@@ -6,9 +6,10 @@ between direction and geometric normal. On light paths, the weight is therefore
 
     F |ω_c·n_g| / |ω_l·n_g|        [Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, p. 155]
 
-Here F is evaluated exactly as on camera paths, with ``wi`` = ω_c and ``wo`` = ω_l. The factor does not contain n_s. It
-is therefore also correct for BSDFs that perturb the normal (`bumpmap`, `normalmap`), for which Mitsuba does not return
-n_s. On light paths, ``si.wi`` is ω_l.
+Here F is evaluated exactly as on camera paths, with ``wi`` = ω_c and ``wo`` = ω_l. At the vertices of light paths,
+however, ``si.wi`` is ω_l. `smooth_adjoint` therefore exchanges the two directions. The quotient of cosines does not
+contain n_s. The weight is therefore also correct for BSDFs that perturb the normal (`bumpmap`, `normalmap`), for which
+Mitsuba does not return n_s.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ def delta_adjoint(v: Vertex, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
     """Return the factor by which the weight of a delta lobe sampled in importance mode must be multiplied.
 
     The normal at which the light is reflected or refracted is parallel to h = ω_l + η ω_c, with η the relative index of
-    refraction across the lobe. The factor contains |h·ω_l| / |h·ω_c|, because refraction changes solid angles by this
-    ratio times a power of η. The power of η is not part of weights in importance mode.
+    refraction across the lobe. Refraction changes solid angles by |h·ω_l| / |h·ω_c| times a power of η. The returned
+    factor contains this quotient, but no power of η, which is not part of weights in importance mode.
     """
     cos = dr.dot(v.si.wi, wo)
     a, b = 1 + eta * cos, cos + eta  # h·ω_l and h·ω_c

@@ -43,7 +43,7 @@ class InMedium:
     mei: mi.MediumInteraction3f
     phase: mi.PhaseFunctionPtr
     flight: Flight
-    w: mi.Spectrum  # weight of the radiance from the vertex: flight.W, times σ_s / density at a collision
+    w: mi.Spectrum  # weight of the radiance from the vertex: flight.W, multiplied by σ_s / density if ``event``
     e: mi.Spectrum  # radiance emitted by the medium along the flight
 
 
@@ -101,8 +101,8 @@ def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
 def sees_lights(trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
     """Return the lanes in which emission along the ray is visible.
 
-    With ``hide_emitters``, the environment is invisible to the camera. If caustics are omitted, area lights are
-    invisible along delta lobes, on paths whose first vertex has scattered with a smooth lobe.
+    With ``hide_emitters``, the environment is invisible to the camera. If caustics are omitted, an area light is
+    invisible to a ray from a delta lobe if the first vertex of the path has scattered with a smooth lobe.
     """
     if trace.without_caustics:
         active = active & ~(at.delta & at.scattered & si.is_valid())

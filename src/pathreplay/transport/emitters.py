@@ -109,7 +109,8 @@ def _at_fixed_point(
     facing = dr.abs(dr.dot(y.A, towards))
     ok = active & hit.is_valid() & (hit.shape.emitter() == still.emitter) & (facing > 0)
     dist2 = dr.select(ok, dr.squared_norm(towards), 1)
-    log_J = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)  # log solid angle of an area element at the point
+    # Up to a constant, log_J is the log of the solid angle of an area element at y, as seen from the origin.
+    log_J = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
     J = dr.replace_grad(mi.Float(1), log_J)
     light = dr.copy(still)
     light.p = dr.select(ok, dr.replace_grad(still.p, y.p), still.p)

@@ -28,7 +28,7 @@ def meet(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool, coherent: bool = Fa
 def short_of_end(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """Return the hit, moved away from the end of its segment if it lies on a B-spline curve."""
+    """Return the hit. A hit on a B-spline curve is moved away from the end of its segment."""
     if trace.traits.splines:
         kind = shape_met(trace, hit, ray, active).shape_type()
         on_spline = active & hit.is_valid() & (kind == int(mi.ShapeType.BSplineCurve))

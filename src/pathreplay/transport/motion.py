@@ -41,7 +41,7 @@ def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Sha
 def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
     """Return the lanes in which a parameter may move the surface that was hit.
 
-    If the moving shapes are not known individually (see `moving_shapes`), these are all lanes, including misses.
+    If `moving_shapes` returned None, the result is True in all lanes, including misses.
     """
     moving = trace.traits.moving
     if moving is None:
@@ -83,8 +83,8 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        # `edges_move` ignores smooth lobes that are sampled attached. Boundary terms need attach = 'delta', and
-        # smooth lobes are then sampled attached only in scenes without silhouettes.
+        # For `edges_move`, ``painted`` is False, and smooth lobes that are sampled attached are ignored. Boundary terms
+        # need attach = 'delta'. Smooth lobes are then sampled attached only in scenes without outlines.
         for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
             moving.append(sample.wo)
@@ -94,10 +94,10 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
 
 
 def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
-    """Return whether the weight of a continuation on a surface depends on parameters with gradients.
+    """Return whether the weight of scattering at a surface depends on parameters with gradients.
 
-    The result is valid only if the paths do not move. ``at`` is the first arrival. The function records the weight of a
-    lobe symbolically, like later passes, and checks whether the weight has gradients. Nothing is evaluated.
+    The result is valid only if `path_moves` is False. ``at`` is the first arrival. As later passes do, the function
+    records the weight of a lobe symbolically. It then checks whether the weight has gradients. Nothing is evaluated.
     """
     lobe, valid = at.hit.prim_index, at.hit.is_valid()  # arrays whose values Dr.Jit does not know while it traces
     si = at.hit.compute_surface_interaction(at.ray, compat.shading(), valid)

@@ -1,7 +1,8 @@
 """The step of a light path: one vertex, connected to the sensor instead of to an emitter.
 
 A light path satisfies the same recursion L_i = e_i + w_i L_{i+1} as a camera path. Here, e_i is the contribution of
-vertex i to the film, times the adjoint of the image at its film position. BSDFs are evaluated in importance mode.
+vertex i to the film, times the adjoint of the image at the film position of this contribution. BSDFs are evaluated in
+importance mode.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ def choose_step(
 ) -> SampledStep:
     """Sample a step, and test whether the sensor sees the vertex. Nothing is differentiated.
 
-    At the last vertex, ``go_on`` is False, and the path is connected but not continued. In ``trace.to_sensor.caustics``
-    mode, the first vertex is not connected, and only delta lobes continue the path from there.
+    At the last vertex, ``go_on`` is False, and the path is connected but not continued. If
+    ``trace.to_sensor.caustics``, the first vertex is not connected, and only delta lobes continue the path after the
+    first vertex.
     """
     link, ctx = _link(trace), mi.BSDFContext(mi.TransportMode.Importance)
     v = arrive.choose(trace, at, sampler, mi.Spectrum(1), active)

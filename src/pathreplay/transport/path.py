@@ -14,7 +14,8 @@ from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples, reciprocal
 from pathreplay.transport.volume.passage import skip_null
 
-# Russian roulette terminates at least one path in twenty, so that paths between mirrors end.
+# At each vertex from ``rr_depth`` on, Russian roulette terminates at least one path in twenty. Paths between mirrors
+# therefore end.
 MAX_SURVIVAL = 0.95
 
 
@@ -112,7 +113,7 @@ def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spe
 def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.Bool) -> Arrival:
     """Trace the continuation of a step to the next vertex. ``at`` is the arrival at the vertex of the step.
 
-    MIS ignores null boundaries between media: the density of the last scattering event remains in effect behind them.
+    MIS ignores null boundaries between media: the density of the last scattering event remains valid behind a boundary.
     """
     kept, null, ray = step.kept, step.null, step.ray_next
     hit = meet(trace, ray, active)

@@ -33,14 +33,14 @@ from pathreplay.transport.vertex import (
 SAME_LOBE = 1e-3
 
 # A lobe counts as narrow if its density at the centre is larger than the density of a diffuse lobe, 1/π. With detached
-# sampling, the noise of the gradient is proportional to the slope of the log density. With attached sampling, it is
-# proportional to the slope of the incident radiance. docs/gradients.md lists the variances for different roughnesses.
+# sampling, the noise of the gradient is proportional to the slope of the log density. With attached sampling, the noise
+# is proportional to the slope of the incident radiance. docs/gradients.md lists the variances for several roughnesses.
 NARROW = 1 / dr.pi
 
 
 @dataclass
 class Sampled:
-    """The continuation sampled at a vertex, and the scattering of light from the emitter sample's direction."""
+    """The continuation sampled at a vertex, and the BSDF or phase function in the direction of the emitter sample."""
 
     f: mi.Spectrum  # BSDF or phase function, times cosine on surfaces, for the direction of the emitter sample
     pdf_light: mi.Float  # density of sampling the direction of the emitter sample
@@ -168,9 +168,8 @@ def _at_surface(
     if ctx.mode == mi.TransportMode.Importance:
         f = smooth_adjoint(v, wo, smooth)
     w = f * J * dr.detach(reciprocal(kept.pdf))
-    # A failed sample has weight zero even if f is not zero (`roughdielectric` may sample a reflected direction on the
-    # wrong side of the surface). If the weight is zero because the BSDF is black, f is zero as well. The derivative of
-    # the weight is then kept.
+    # The weight of a failed sample is zero even if f is not zero: `roughdielectric` may sample a reflected direction on
+    # the wrong side of the surface. If the BSDF is black, both f and the weight are zero, and w keeps its derivative.
     w = dr.select(kept.black & dr.any(dr.detach(f) != 0), 0, w)
 
     if attached and trace.resamples:

@@ -26,8 +26,8 @@ class Sighting:
     d: mi.Vector3f  # unit direction to the sensor
     end: mi.Point3f  # point up to which occlusion is tested: on the near plane of a camera, or on the irradiance meter
     s: mi.Point2f  # film position in pixels, relative to the crop window
-    W: mi.Float  # importance over the density of the aperture sample
-    valid: mi.Bool  # without occluders, the sensor sees the point; ``s`` may be up to ``reach`` pixels outside
+    W: mi.Float  # importance divided by the density of the aperture sample
+    valid: mi.Bool  # without occluders, the sensor sees the point; ``s`` may be up to ``reach`` pixels off the film
 
     @staticmethod
     def none() -> Sighting:
@@ -73,7 +73,7 @@ class SensorLink:
         return mi.ScalarVector2f(self.sensor.film().crop_size())
 
     def moves(self) -> bool:
-        """Return whether connections depend on parameters of the sensor with gradients."""
+        """Return whether connections depend on sensor parameters that have gradients."""
         with dr.resume_grad():
             origin = dr.zeros(mi.Interaction3f)
             origin.p = mi.Point3f(0.1, 0.2, 3)
@@ -83,8 +83,8 @@ class SensorLink:
     def sight(self, origin: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> Sighting:
         """Connect a point to the sensor, differentiably in the point and the sensor. Occlusion is not tested.
 
-        The random numbers ``u`` select a point on the aperture of a thin lens or on an irradiance meter. The point has
-        fixed coordinates there, and moves with the sensor.
+        The random numbers ``u`` select a point on the aperture of a thin lens or on an irradiance meter. This point
+        has fixed coordinates on the aperture or meter, and moves with the sensor.
         """
         if self.sensor.class_name() == METER:
             return self._meter(origin, u, active)

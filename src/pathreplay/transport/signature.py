@@ -12,7 +12,8 @@ from pathreplay.transport.vertex import TraceConfig
 
 TUBES = mi.ShapeType.Cylinder, mi.ShapeType.BSplineCurve, mi.ShapeType.LinearCurve
 """Shapes that are open at both ends: their outlines consist of silhouettes and rims."""
-# The edge of a tube is its silhouette if the cosine between ray and normal is smaller than this, and its rim otherwise.
+# The edge of a tube is its silhouette if the cosine between ray and normal is smaller than `GRAZING`, and its rim
+# otherwise.
 GRAZING = 0.05
 
 
@@ -64,8 +65,8 @@ def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
 def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
     """Compute the unit vector perpendicular to the ray and to an edge near the hit. Detached.
 
-    The edge is the nearest side of the triangle on meshes, the rim on rectangles and disks, the nearer of rim and
-    silhouette on tubes, and the silhouette on other shapes.
+    The edge is the nearest side of the triangle on meshes, the rim on rectangles and disks, the rim or the silhouette
+    on tubes (see `GRAZING`), and the silhouette on other shapes.
     """
     with dr.suspend_grad():
         si = hit.compute_surface_interaction(ray, compat.shading(), active)
@@ -111,7 +112,7 @@ def _nearest_side(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
     a, b, c = compat.triangle_corners(hit, ray, active)
     sides = (c - b, c - a, b - a)  # the sides opposite to a, b and c
     weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
-    # Distances of the point from the sides, divided by twice the area of the triangle.
+    # Distances of the hit point from the sides, divided by twice the area of the triangle.
     heights = [dr.abs(w) * dr.rcp(dr.norm(side)) for w, side in zip(weights, sides, strict=True)]
     nearest = dr.select(heights[1] < heights[2], sides[1], sides[2])
     return dr.select(heights[0] < dr.minimum(heights[1], heights[2]), sides[0], nearest)

@@ -12,7 +12,8 @@ from pathreplay.platform import compat
 
 T = TypeVar("T", bound="dr.ArrayBase")
 
-# A surface is treated as a sphere if dn = κ dp is satisfied up to this squared relative error.
+# A surface with normal n and position p is treated as a sphere of curvature κ if dn = κ dp is satisfied up to this
+# squared relative error.
 UMBILIC = 1e-4
 # Derivatives of hits on spheres and cylinders are set to zero if the cosine between ray and normal is below this value.
 # In compensation, they are doubled between this value and twice this value.
@@ -25,8 +26,8 @@ def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi
     The derivative of the distance to a sphere or cylinder is proportional to 1 / c, with c the cosine between ray and
     normal. The mean square of this derivative over rays is infinite. Where rounding puts a ray onto the silhouette, the
     derivative reaches many millions. Derivatives are therefore set to zero for c < `GRAZES` and doubled for `GRAZES` <=
-    c < 2 `GRAZES`. This keeps the mean, because both bands contribute equally: for uniformly distributed rays, the
-    density of c is proportional to c and cancels 1 / c. The remaining bias is of second order in `GRAZES`.
+    c < 2 `GRAZES`. The doubling preserves the mean, because both bands contribute equally: for uniformly distributed
+    rays, the density of c is proportional to c and cancels 1 / c. The remaining bias is of second order in `GRAZES`.
     """
     si = hit.compute_surface_interaction(ray, compat.shading(), active)
     kind = si.shape.shape_type()
@@ -103,7 +104,7 @@ def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
 
 
 def _curvature(y: mi.SurfaceInteraction3f) -> mi.Float:
-    """Return the curvature κ with dn = κ dp for all tangents; infinite if no such κ exists."""
+    """Return the curvature κ of a surface: dn = κ dp for the normal n and point p. Infinite if no such κ exists."""
     turn = dr.squared_norm(y.dn_du) + dr.squared_norm(y.dn_dv)
     κ = dr.dot(y.dn_du, y.dp_du) / dr.squared_norm(y.dp_du)
     rest = dr.squared_norm(y.dn_du - κ * y.dp_du) + dr.squared_norm(y.dn_dv - κ * y.dp_dv)

@@ -1,4 +1,4 @@
-"""Velocity of sampled directions while the scene moves: a blend of following the next hit point and staying constant.
+"""Velocity of sampled directions while the scene moves. A direction follows its next hit point, fully or in part.
 
 Let x be a vertex, y the hit point of its continuation along d, and r = |y - x|. An integral over directions does not
 depend on its parametrisation. When the parameters change, the direction d may therefore move with any velocity field
@@ -9,18 +9,18 @@ parameter. Two simple fields are
     0      d is constant
 
 With V_H, the edges of emitters and the seams between materials have fixed positions in the integrand. With other
-fields, their motion is a boundary term, which the interior term does not contain. However, let h be the distance from x
-to the plane of y. If x moves parallel to this plane, (log J_H)' grows like 1/h, and the variance is infinite wherever
-two surfaces touch. The field used here is therefore the blend V = φ V_H, with φ = 1 - exp(-m), m = h r / h0² and the
-length h0 of `blend_length`:
+fields, the motion of edges and seams is a boundary term, which the interior term does not contain. However, let h be
+the distance from x to the plane of y. If x moves parallel to this plane, (log J_H)' grows like 1/h, and the variance is
+infinite wherever two surfaces touch. The field used here is therefore the blend V = φ V_H, with φ = 1 - exp(-m),
+m = h r / h0² and the length h0 of `blend_length`:
 
     (log J)' = φ (log J_H)' + ∇φ·V_H,        ∇φ·V_H = -m exp(-m) (n·d_H') / (n·d)
 
 Here n is the normal of the plane, and d_H the direction to y. In ∇φ, only r depends on d, because all directions that
 hit the plane have the same h. The factor r in m keeps V close to V_H at distant hit points on a near plane. Such points
-may lie on edges. The cost in variance is small, because few directions, at grazing angles, reach them. For a sphere, h
-is the distance from x to the sphere. This distance does not depend on d either, and does not vanish at the silhouette.
-On other curved shapes, V = V_H.
+may lie on edges. The cost in variance is small, because only a few directions, all at grazing angles, reach such
+points. For a sphere, h is the distance from x to the sphere, which is also independent of d. This distance does not
+vanish at the silhouette. On other curved shapes, V = V_H.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ import mitsuba as mi
 
 from pathreplay.transport.surface import SurfacePoint, surface_point
 
-# h0 relative to the size of the shape that was hit. A larger value gives less noise. Without boundary terms, a larger
-# value also omits more of the derivative due to moving edges nearby. docs/gradients.md has measurements for 0.003 to
-# 0.03.
+# Length h0 relative to the size of the shape that was hit. A larger value gives less noise. Without boundary terms, a
+# larger value also omits more of the derivative due to moving edges nearby. docs/gradients.md has measurements for
+# 0.003 to 0.03.
 BLEND = 0.01
-# Value of m above which V equals V_H to within 0.1 %.
+# Value of m (see the module docstring) above which the velocity V equals V_H to within 0.1 %.
 CLOSE = 7.0
 
 

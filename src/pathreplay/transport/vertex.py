@@ -105,13 +105,13 @@ class VertexSamples:
 
     @staticmethod
     def draw(sampler: Sampler) -> VertexSamples:
-        """Draw the random numbers of one vertex, always in this order."""
+        """Draw the random numbers of one vertex, in the order of the fields."""
         return VertexSamples(sampler.next_2d(), sampler.next_1d(), sampler.next_2d(), sampler.next_1d())
 
 
 @dataclass
 class Arrival:
-    """The arrival of a path at a vertex: the ray, its nearest hit, and its sampling density."""
+    """The arrival of a path at a vertex: the ray, its nearest hit, and the sampling density of its direction."""
 
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
@@ -158,7 +158,7 @@ class Flight:
     density: mi.Float  # p σ̄, with p the probability of a real collision and σ̄ the majorant; 1 without a collision
     W: mi.Spectrum  # product of the weights of all null collisions on the flight; 1 in grey media
     along: mi.Float  # random offset in [0, 1) of the points at which the transmittance is differentiated
-    p: mi.Float = None  # type: ignore[assignment]  # probability that the collision was real (None if no null collisions are kept)
+    p: mi.Float = None  # type: ignore[assignment]  # probability that the collision was real (None without null branching)
     # None without emissive media:
     E: mi.Spectrum = None  # type: ignore[assignment]  # emission accumulated along the flight
     t_emit: mi.Float = None  # type: ignore[assignment]  # distance of the tentative collision at which emission is differentiated
@@ -169,7 +169,7 @@ class Flight:
 
     @staticmethod
     def none(media: Media) -> Flight:
-        """Create a flight of length zero without a collision, with the fields of the sampling pass."""
+        """Create a flight of length zero without a collision, with all fields that the sampling pass needs."""
         zero, nothing = mi.Float(0), mi.Spectrum(0)
         flight = Flight(mi.Bool(False), zero, mi.Float(1), mi.Spectrum(1), mi.Float(0), σ_s=nothing)
         if media.emissive:
@@ -178,7 +178,7 @@ class Flight:
 
     @property
     def weight(self) -> mi.Spectrum:
-        """Weight of the radiance from the flight's end: ``W``, times σ_s / density at a collision."""
+        """Weight of the radiance from the flight's end: ``W``, multiplied by σ_s / density if ``event``."""
         return dr.select(self.event, self.σ_s * dr.rcp(self.density), 1) * self.W
 
 
@@ -255,7 +255,7 @@ class Signature:
 class Splat:
     """The contribution of a vertex of a light path to the film, without the throughput up to this vertex."""
 
-    c: mi.Spectrum  # f W, with W the importance of the sensor
+    c: mi.Spectrum  # f W: scattering f towards the sensor (see `scatter.towards`), times the importance W of the sensor
     s: mi.Point2f  # film position in pixels
 
 
@@ -263,8 +263,10 @@ class Splat:
 class Step:
     """One vertex of a path, with L_i = e_i + w_i L_{i+1}, and the ray that continues the path."""
 
-    e: mi.Spectrum  # emission (MIS weighted) + next-event estimate; on light paths, contribution times image adjoint
-    w: mi.Spectrum  # f/p or lobe weight, before Russian roulette
+    # On camera paths: emission (MIS weighted) plus the next-event estimate. On light paths: the contribution to the
+    # film, times the adjoint of the image.
+    e: mi.Spectrum
+    w: mi.Spectrum  # f/p of a smooth lobe, or the weight of a delta lobe, without Russian roulette
     ray_next: mi.Ray3f
     pdf: mi.Float  # density of the continuation, for the MIS weight at the next vertex
     signature: Signature
@@ -284,7 +286,7 @@ class SampledStep(Step):
 
     @property
     def seen(self) -> mi.Bool:
-        """Mitsuba's alpha: whether the ray met a surface or a real collision; it is then scattered or absorbed."""
+        """Mitsuba's alpha: whether the ray was scattered or absorbed at a surface, or had a real collision."""
         return self.signature.met & ~self.null
 
 

@@ -79,7 +79,7 @@ class Traits:
     veils: bool  # some surface may scatter part of the light and transmit the rest unscattered
     masks_mirrors: bool  # some mask covers delta lobes
     narrow: bool  # some surface may have a narrow smooth lobe
-    glossy: bool  # `narrow`, and no checkerboard exists (its seams are not covered by boundary terms)
+    glossy: bool  # `narrow` is True, and there is no checkerboard, whose seams boundary terms do not cover
     outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
     tables: Tables = None  # type: ignore[assignment]  # for the current pass, like all fields below
     # The fields `lights_deform` to `lights_vary` tell whether the parameters in their comments have gradients.
@@ -143,8 +143,8 @@ def tables_of(
 def _array(kind: type[A], values: ArrayLike) -> A:
     """Create an array of these values.
 
-    While `dr.freeze` records, arrays must not be created from host memory. The array is then written by recorded
-    scatters, one per run of equal values.
+    While `dr.freeze` records, arrays must not be created from host memory. Recorded scatter operations then fill the
+    array, with one operation for each run of equal values.
     """
     if not dr.flag(dr.JitFlag.FreezingScope):
         return kind(values)

@@ -31,10 +31,11 @@ POINTS = 4
 def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
     """Return 1 / (p + c (1 - p)) for probability p of a real collision and relative weight c of null collisions.
 
-    The derivative of in-scattering is dσ_s L_s, with L_s the in-scattered radiance. It may be nonzero where σ_s is zero
-    and real collisions cannot occur. Real collisions therefore estimate only the fraction p / (p + c (1 - p)) of this
-    derivative, and null collisions estimate the rest. L_s is estimated at each real collision, but at only one null
-    collision per path. All estimates have equal weight if c is the inverse of the number of null collisions.
+    The derivative of in-scattering is dσ_s L_s, with L_s the in-scattered radiance. This derivative may be nonzero
+    where σ_s is zero and real collisions cannot occur. Real collisions therefore estimate only the fraction
+    p / (p + c (1 - p)) of this derivative, and null collisions estimate the rest. L_s is estimated at each real
+    collision, but at only one null collision per path. All estimates have equal weight if c is the inverse of the
+    number of null collisions.
     """
     return dr.rcp(p + c * (1 - p))
 
@@ -43,9 +44,9 @@ def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
 def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, active: mi.Bool) -> Flight:
     """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
 
-    ``β`` is the throughput, and W the product of the weights of previous null collisions on the flight. In chromatic
-    media, a collision is real with probability p = Σ_k |β_k W_k| σ_k / (σ̄ Σ_k |β_k W_k|), which takes the history of
-    all channels into account.
+    Let ``β`` be the throughput, and W the product of the weights of previous null collisions on the flight. Let σ_k be
+    the extinction in channel k, and σ̄ the majorant. In chromatic media, a collision is real with the probability
+    p = Σ_k |β_k W_k| σ_k / (σ̄ Σ_k |β_k W_k|), which takes the previous weights of all channels into account.
     """
     media = trace.media
     ray, medium = dr.detach(at.ray), at.medium
@@ -129,9 +130,9 @@ def _emission_added(
 def _emission_at_end(
     media: Media, mei: mi.MediumInteraction3f, E: mi.Spectrum, c: mi.Spectrum, real: mi.Bool
 ) -> mi.Spectrum:
-    """Return the emission of a flight that ends at a real collision in a grid that emits per unit of optical depth.
+    """Estimate the emission of flights that end at a real collision in a grid that emits per unit of optical depth.
 
-    This estimate has little noise in opaque media. In all other lanes, the result is ``E``.
+    In opaque media, this estimate has little noise. For all other flights, the result is ``E``.
     """
     for grid in media.grids:
         if grid.emission is not None and grid.emission_per_extinction:
@@ -178,7 +179,7 @@ class Flown:
     """A recorded flight, evaluated again differentiably."""
 
     mei: mi.MediumInteraction3f  # the interaction at the collision
-    w: mi.Spectrum  # weight of radiance from the flight's end: W, times σ_s/density at a collision; differentiable
+    w: mi.Spectrum  # weight of the radiance from the flight's end, as in `Flight.weight`, but differentiable
     e: mi.Spectrum  # emission along the flight, plus a control variate with value zero, whose derivative has mean zero
 
 
@@ -194,11 +195,11 @@ def fly_again(
     Let a and t be the ends of the flight, y points on the flight, x the collision, and b any function of position and
     direction (`TraceConfig.baseline`). The control variate
 
-        (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the second term only if there is a collision)
+        (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (without a collision, only the first term)
 
-    has mean zero, because both terms have the same expectation. For b = 1, it is the score of the sampling density, up
-    to sign. Without the control variate, the variance is high where the radiance is large and the derivative of the
-    radiance with respect to the medium is small.
+    has mean zero, because both terms have the same expectation. For b = 1, the control variate is the score of the
+    sampling density, up to sign. Without the control variate, the variance is high where the radiance is large and the
+    derivative of the radiance with respect to the medium is small.
     """
     medium, ray = at.medium, at.ray
     in_medium = active & (medium != None)  # noqa: E711
@@ -300,10 +301,11 @@ def _emission_again(
 
 
 def _scores_at_collisions(trace: TraceConfig, grid: Grid) -> bool:
-    """Return whether the control variate subtracts the score at a tentative collision instead of the real collision.
+    """Return whether the second term of the control variate is evaluated at a tentative collision, not a real one.
 
-    For emission per unit of optical depth, the derivative of σ is estimated at this tentative collision. The noise of
-    the score and the noise of this derivative then cancel.
+    For the control variate, see `fly_again`. The derivative of emission per unit of optical depth with respect to σ is
+    estimated at the same tentative collision. The noise of the second term and the noise of this derivative then
+    cancel.
     """
     return (
         trace.baseline is not None and not trace.branch and grid.emission is not None and grid.emission_per_extinction
@@ -313,6 +315,6 @@ def _scores_at_collisions(trace: TraceConfig, grid: Grid) -> bool:
 def _guess(
     trace: TraceConfig, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool
 ) -> mi.Spectrum:
-    """Evaluate the baseline. Without null branching, return zero where σ_t = 0, to avoid bias."""
+    """Evaluate `TraceConfig.baseline`. Without null branching, return zero where σ_t = 0, to avoid bias."""
     b = trace.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
     return b if trace.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

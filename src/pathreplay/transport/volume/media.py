@@ -14,7 +14,7 @@ from pathreplay.transport.facts.nodes import nodes_of, with_gradients
 
 
 class Grid(Protocol):
-    """A medium with its own free flight and transmittance: see `gridmedium`."""
+    """A medium that implements free flight and transmittance itself: see `gridmedium`."""
 
     emission: mi.Volume | None
     emission_per_extinction: bool  # `emission_at` is per optical depth, not per length; unused if `emission` is None
@@ -29,9 +29,9 @@ class Grid(Protocol):
 
 @dataclass(frozen=True)
 class Media:
-    """Facts about the media of a scene on which the trace depends."""
+    """Facts about the media of a scene. Recorded kernels depend on these facts."""
 
-    grids: tuple[Grid, ...]  # media with their own free flight and transmittance (`gridmedium`)
+    grids: tuple[Grid, ...]  # media that implement free flight and transmittance themselves (`gridmedium`)
     plain: bool  # there are media other than grids, accessible only through Mitsuba's interface
     homogeneous: bool  # some medium other than a grid has constant coefficients
     chromatic: bool  # some extinction differs between channels
@@ -89,7 +89,7 @@ def wants_branch(media: Sequence[mi.Medium]) -> bool:
 
 
 def _misses(medium: mi.Medium) -> bool:
-    """Return whether extinction has gradients and may be zero somewhere.
+    """Return whether the extinction of a medium has gradients and may be zero somewhere.
 
     Extinction may be zero unless it is constant and its value is known to be nonzero. While `dr.freeze` records, no
     values are known.
@@ -100,7 +100,7 @@ def _misses(medium: mi.Medium) -> bool:
 
 
 def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumInteraction3f:
-    """Create the medium interaction at distance ``t`` along ``ray``, differentiable in both."""
+    """Create the medium interaction at distance ``t`` along ``ray``, differentiable in ``ray`` and ``t``."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.t = t
     mei.p = ray.o + t * ray.d
@@ -113,7 +113,7 @@ def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumIn
 
 
 def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """Return the part [a, b] of the ray up to ``reach`` in which collisions may occur; a = b = 0 if it is empty.
+    """Return the part [a, b] of the ray up to ``reach`` in which collisions may occur; a = b = 0 if none exists.
 
     Differentiable in the ray and in ``reach``.
     """
@@ -125,9 +125,9 @@ def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) 
 
 
 def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """Attach a distance to the moving ends of the interval [a, b]; return it with the interval's stretch factor.
+    """Attach the distance ``t`` to the moving ends of the interval [a, b]; return ``t`` and the stretch factor.
 
-    The returned values are ``t`` and 1, with the derivatives of a + x (b - a) and (b - a) / (b₀ - a₀). Here x is the
+    The returned numbers are ``t`` and 1, with the derivatives of a + x (b - a) and (b - a) / (b₀ - a₀). Here x is the
     constant relative position of ``t`` in the interval, and a₀ and b₀ are the detached ends. Where ``where`` is false
     or b is infinite, both derivatives are zero.
     """

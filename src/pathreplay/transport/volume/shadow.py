@@ -21,9 +21,9 @@ from pathreplay.transport.volume.media import carried, interaction, is_grid, maj
 
 @dataclass
 class Stretch:
-    """Loop state of a shadow ray: the segment up to the next surface. It contains at most one medium."""
+    """Loop state of a shadow ray: the segment up to the next surface. The segment contains at most one medium."""
 
-    ray: mi.Ray3f  # the ray from the last surface on
+    ray: mi.Ray3f  # the rest of the shadow ray, behind the last surface that it met
     far: mi.Float  # length of the whole shadow ray
     gone: mi.Float  # distance from the shadow ray's origin to the last surface
     medium: mi.MediumPtr
@@ -125,7 +125,8 @@ def ratio_tracking(
 def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool, active: mi.Bool) -> mi.Spectrum:
     """Return the recorded transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
 
-    The position of the point y relative to the two surfaces (or ray ends) next to y is constant.
+    The derivative is estimated at the recorded point y. The relative position of y between the last surface before y
+    and the first surface behind y is constant. If there is no such surface, the end of the ray takes its place.
     """
     walked = active & (kept.medium != None)  # noqa: E711
     y, growth = kept.y, mi.Float(1)
