@@ -91,9 +91,9 @@ def page(record: dict[str, Run]) -> str:
     """Return docs/gallery.md."""
     parts = [
         "# Gallery",
-        "What the jobs in `examples/` recover. Each row shows the image at the start, the image of the result, and the "
-        "target. `python -m benchmarks.gallery` makes the runs, the images and this page; times are those of all "
-        "iterations on an otherwise idle machine.",
+        "This page shows what the jobs in `examples/` recover. Each row shows the image at the start, the image of the "
+        "result, and the target. `python -m benchmarks.gallery` makes the runs, the images and this page. The time of "
+        "a run is the time of all its iterations, on an otherwise idle machine.",
         *(section(entry, record.get(entry.name)) for entry in ENTRIES),
     ]
     return "\n\n".join(parts) + "\n"
