@@ -213,7 +213,10 @@ def from_photos(
     ] = None,
     minutes: Annotated[float, typer.Option(help="Time limit, from which iterations follow.")] = 30.0,
     test_every: Annotated[int, typer.Option(metavar="N", help="The first and every N-th photo are test views.")] = 5,
-    width: Annotated[int | None, typer.Option(help="Width of the compared images in pixels (default: images of about 46 000 pixels).")] = None,
+    width: Annotated[
+        int | None,
+        typer.Option(help="Width of the compared images in pixels (default: images of about 46 000 pixels)."),
+    ] = None,
     refine_poses: Annotated[bool, typer.Option("--refine-poses", help="Also optimise the poses.")] = False,
     no_run: Annotated[bool, typer.Option("--no-run", help="Only write the job.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,

@@ -109,7 +109,7 @@ def test_what_follows_nothing_says_that_nothing_moves() -> None:
 
 @pytest.mark.parametrize(
     ("driver", "message"),
-    [(listing, "does not differentiate motion"), (replay, "cannot follow")],
+    [(listing, "does not differentiate motion"), (replay, "does not support parameters that move paths")],
     ids=["listing", "replay"],
 )
 def test_what_cannot_follow_motion_in_fog_refuses(driver: Callable[..., bool], message: str) -> None:

@@ -50,8 +50,8 @@ def replay(
         _replay_still(trace, start, path, δL)
     elif trace.media is not None:
         raise PathreplayError(
-            "adjoint = 'replay' cannot follow paths that move through media: use adjoint = 'recorded', "
-            f"with max_depth of at most {MAX_DEPTH_MEDIA}"
+            "adjoint = 'replay' does not support parameters that move paths in scenes with media: use "
+            f"adjoint = 'recorded', with max_depth of at most {MAX_DEPTH_MEDIA}"
         )
     else:
         if has_smooth_lobes(trace):

@@ -67,8 +67,8 @@ NULL_BRANCHING: Property[str | bool] = Property(
     "null_branching",
     "string or boolean",
     "auto",
-    "Trace one more path from a null collision, as if the medium had scattered there. `auto` does so if extinction "
-    "with gradients varies in space or is zero.",
+    "Trace an additional path from one null collision, as if the medium had scattered there. `auto` does so if an "
+    "extinction with gradients varies in space or is zero.",
     ("auto", True, False),
     "media.md#what-is-differentiated",
 )

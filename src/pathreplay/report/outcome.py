@@ -222,7 +222,7 @@ class RecoveredPose:
                 table["truth"] = self.pose.truth.tolist()
         table |= {kind: asdict(error) for kind, error in self.errors().items()}
         if self.pose.distance is not None:
-            table["distance"] = self.pose.distance
+            table["error_scale"] = self.pose.distance
         return table
 
 
