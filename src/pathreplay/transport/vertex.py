@@ -78,7 +78,8 @@ class TraceConfig:
     def follows(self) -> bool:
         """Whether smooth lobes may be sampled attached.
 
-        With ``attach='delta'``, only narrow lobes in scenes without outlines are sampled attached.
+        With ``attach='delta'``, narrow lobes are sampled attached if the scene has no outlines. Other smooth lobes are
+        not sampled attached.
         """
         narrow = self.attach == "delta" and not self.traits.outlines
         return bool(self.traits.attachables) and (narrow or self.attach == "all")

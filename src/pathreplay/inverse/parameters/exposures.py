@@ -43,7 +43,10 @@ class Factors:
         return self._log.latent(values)
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """See `Coordinates`. The gradient includes the derivative of the subtracted mean."""
+        """See `Coordinates`.
+
+        `values` subtracts the mean of the logarithms in ``fixed``. The gradient includes the derivative of this mean.
+        """
         by_latent = self._log.gradient(values, by_values)
         if self.fixed:
             by_latent[self.fixed] -= by_latent.sum(axis=0) / len(self.fixed)
