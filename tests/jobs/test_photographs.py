@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from pathreplay.inverse.images.io import exr_bytes, png_bytes
 from pathreplay.jobs.photographs.pictures import BLOCK, frames_of, prepare
 from pathreplay.jobs.photographs.plan import LEAST, Speed, plan_stages
 from pathreplay.jobs.photographs.reading import find_photos
-from pathreplay.jobs.photographs.region import find_region
+from pathreplay.jobs.photographs.region import find_region, sky_rows
 from pathreplay.output.surface_scene import export_surface
 
 VIEWS, SIZE, FOV = 10, 32, 0.75
@@ -115,6 +116,21 @@ def test_the_region_is_what_cameras_see(capture: Path) -> None:
     np.testing.assert_allclose(region.centre, [1, 0, 0], atol=0.4)
     assert (region.size > 2).all()
     assert (region.size < 6.5).all()
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "focal", "rows"),
+    [(160, 90, 45, 16), (90, 160, 45, 16), (160, 90, 150, 32), (160, 90, 300, 64), (160, 90, 9000, 128)],
+)
+def test_the_sky_is_as_fine_as_photographs_need(
+    capture: Path, width: int, height: int, focal: float, rows: int
+) -> None:
+    """A sky of 16 rows has 8 pixels along 90 degrees."""
+    frames = [
+        replace(frame, width=width, height=height, focal=focal)
+        for frame in frames_of(find_photos(capture).photos, None)
+    ]
+    assert sky_rows(frames) == rows
 
 
 def test_frames_without_an_image_are_left_out(capture: Path, tmp_path: Path) -> None:

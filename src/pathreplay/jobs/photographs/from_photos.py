@@ -17,12 +17,12 @@ import numpy as np
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.dataset.capture import pinhole_camera
 from pathreplay.inverse.images.io import exr_bytes
-from pathreplay.jobs.photographs.job_text import SKY_SIZE, Choices, field_scene, job_text, mesh_scene
+from pathreplay.jobs.photographs.job_text import Choices, field_scene, job_text, mesh_scene
 from pathreplay.jobs.photographs.mesh import GREY, Proxy, read_proxy
 from pathreplay.jobs.photographs.pictures import Frame, Prepared, frames_of, prepare
 from pathreplay.jobs.photographs.plan import Speed, StagePlan, plan_stages
 from pathreplay.jobs.photographs.reading import TRANSFORMS, find_photos
-from pathreplay.jobs.photographs.region import Box, find_region, near_clip
+from pathreplay.jobs.photographs.region import Box, find_region, near_clip, sky_rows
 from pathreplay.platform import backend
 from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.scenes.loading import load_scene
@@ -104,7 +104,7 @@ def from_photos(
             part, {TRANSFORMS: (json.dumps({"camera_model": "PINHOLE", "frames": entries}, indent=1) + "\n").encode()}
         )
         has_sky = not prepared.transparent
-        _write_start(part, region, prepared.mean, proxy)
+        _write_start(part, region, prepared.mean, sky_rows(frames), proxy)
         text = field_scene(region, has_sky) if proxy is None else mesh_scene(proxy.stored, proxy.kind, proxy.textured)
         _write(part, {"scene.xml": text.encode()})
         size = max(frame.width for frame in frames), max(frame.height for frame in frames)
@@ -162,11 +162,11 @@ def _write(folder: Path, files: dict[str, bytes]) -> None:
         (folder / name).write_bytes(data)
 
 
-def _write_start(folder: Path, region: Box, mean: np.ndarray, proxy: Proxy | None) -> None:
-    """Write the initial values: a sky in the mean colour, and a faint medium in the mean colour or a grey mesh."""
+def _write_start(folder: Path, region: Box, mean: np.ndarray, rows: int, proxy: Proxy | None) -> None:
+    """Write the initial values: a faint medium or a grey mesh, and a sky with ``rows`` rows, in the mean colour."""
     start = folder / "start"
     start.mkdir()
-    sky = np.broadcast_to(mean, (*SKY_SIZE, 3)).astype(np.float32)
+    sky = np.broadcast_to(mean, (rows, 2 * rows, 3)).astype(np.float32)
     _write(folder, {"start/sky.exr": exr_bytes(sky)})
     if proxy is not None:
         proxy.write(start)

@@ -10,7 +10,6 @@ from pathreplay.jobs.photographs.plan import EVAL_SPP, Plan
 from pathreplay.jobs.photographs.region import Box
 
 DENSITY, RADIANCE, SKY = "box.interior_medium.sigma_t.data", "box.interior_medium.radiance.data", "sky.data"
-SKY_SIZE = (16, 32)
 
 
 @dataclass(frozen=True)
@@ -193,7 +192,7 @@ _SKY = f"""\
 key = "{SKY}"
 parameterization = "log"
 pyramid = true
-learning_rate = 0.003
+learning_rate = 0.01
 """
 
 _POSES = """\

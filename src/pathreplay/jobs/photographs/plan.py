@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-EVAL_SPP = 32
+EVAL_SPP = 128
 VIEWS = 8
 """Training views per iteration, half as many at full resolution."""
 SAMPLES = 160_000

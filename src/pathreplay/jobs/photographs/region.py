@@ -16,6 +16,10 @@ SEEN_BY = 0.4
 """Fraction of the cameras that see a cell of the region."""
 NEAR = 0.35
 """Distance from which a camera sees the medium, as a fraction of the smallest distance of a camera from the centre."""
+ACROSS = 8
+"""Approximate number of pixels of the sky along the shorter side of a photograph."""
+LEAST_ROWS, MOST_ROWS = 16, 128
+"""Smallest and largest height of the sky in pixels."""
 CELLS = 40
 """Number of cells along a side of the cube."""
 
@@ -75,6 +79,13 @@ def near_clip(frames: Sequence[Frame]) -> float:
     """
     places = np.array([frame.place for frame in frames])
     return NEAR * float(np.linalg.norm(places[:, :3, 3] - _focus(places), axis=1).min())
+
+
+def sky_rows(frames: Sequence[Frame]) -> int:
+    """Return the height of the sky in pixels, a power of two. The narrower the photographs, the finer the sky."""
+    sides = np.array([min(frame.width, frame.height) / frame.focal for frame in frames])
+    angle = 2 * np.arctan(np.median(sides) / 2)
+    return int(np.clip(2 ** np.round(np.log2(np.pi * ACROSS / angle)), LEAST_ROWS, MOST_ROWS))
 
 
 def _focus(places: np.ndarray) -> np.ndarray:
