@@ -19,7 +19,6 @@ class Kind:
     integrators: tuple[str, ...] = ("prb",)
     has_grid: bool = False  # textures or volumes among the unknowns
     few: bool = False  # no more unknown numbers than Levenberg-Marquardt takes
-    heavy: bool = False  # takes longer than others
     pixels: int = 24  # of an edge in a full run
 
     def build(self, pixels: int) -> Problem:
@@ -36,9 +35,9 @@ PROBLEMS: dict[str, Kind] = {
     "texture under a sky": Kind(texture, has_grid=True, pixels=48),
     "camera: pose and focal length": Kind(camera, PROJECTIVE + NO_GRADIENT, few=True),
     "room: two lamps, four materials": Kind(room, few=True),
-    "cloud": Kind(cloud, ("prbvolpath",), has_grid=True, heavy=True),
+    "cloud": Kind(cloud, ("prbvolpath",), has_grid=True),
     "object: albedo and roughness, unknown sky": Kind(object_under_sky, has_grid=True, pixels=48),
-    "glass pane: index and normals": Kind(glass, has_grid=True, heavy=True),
-    "mesh by shadows": Kind(mesh, PROJECTIVE, heavy=True),
+    "glass pane: index and normals": Kind(glass, has_grid=True),
+    "mesh by shadows": Kind(mesh, PROJECTIVE),
     "metal fitted by principled": Kind(metal, few=True),
 }

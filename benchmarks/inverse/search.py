@@ -73,12 +73,16 @@ def searched(rates: Sequence[float], samples: Sequence[int], run: Try, budget: f
     for spp, rate in product(samples, rates):
         curve = run(rate, spp, budget)
         budget = min(budget, reached(curve, MIDDLE)[0])
-        yield replace(curve, rate=rate, spp=spp)
+        yield replace(curve, rate=rate, spp=spp, searched=True)
 
 
-def best(curves: Sequence[Curve]) -> Curve:
-    """The curve that reaches the middle mark first; if none does, the one with the smallest final error."""
-    return min(curves, key=lambda curve: (reached(curve, MIDDLE)[0], curve.errors[-1] / curve.errors[0]))
+def best(curves: Sequence[Curve], mark: float) -> Curve:
+    """The curve of the search that reaches a mark first; if none does, the one with the smallest final error.
+
+    The search ends at the middle mark, so the choice for a smaller mark is that for the middle mark.
+    """
+    goal, found = max(mark, MIDDLE), [curve for curve in curves if curve.searched]
+    return min(found, key=lambda curve: (reached(curve, goal)[0], curve.errors[-1] / curve.errors[0]))
 
 
 def reached(curve: Curve, mark: float) -> tuple[float, float]:

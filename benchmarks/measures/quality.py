@@ -1,4 +1,4 @@
-"""Optimisations of an inverse problem, with the best point of one grid for each loop: see task `quality`."""
+"""Optimisations of an inverse problem, with the best points of one grid for each loop: see task `quality`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from .job import Curve, Job, Measure
 
 
 class Quality(Measure):
-    """The first call of a method searches the grid; later calls run its best point with their seeds."""
+    """The first call of a method searches the grid; later calls run the best points for the marks with their seeds.
+
+    The best point for the largest mark runs until that mark only, unless it is that for the other marks, too.
+    """
 
     SEARCH_SEED = 1000
     """Seed of the search: no round has it, so that luck in the search does not repeat itself."""
@@ -30,20 +33,23 @@ class Quality(Measure):
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """Seconds until the middle mark (all seconds of the optimisation, if it is not reached), and the last error."""
         if method in self.curves:
-            choice = best([curve for curve in self.curves[method] if curve.searched])
-            curve = self._run(method, choice.rate, choice.spp, seed, min(MARKS), self.job.budget)
+            main, first = (best(self.curves[method], mark) for mark in (MIDDLE, max(MARKS)))
+            curve = self._run(method, main.rate, main.spp, seed, min(MARKS), self.job.budget)
             self.curves[method].append(curve)
+            if (first.rate, first.spp) != (main.rate, main.spp):
+                self.curves[method].append(self._run(method, first.rate, first.spp, seed, max(MARKS), self.job.budget))
             seconds = min(reached(curve, MIDDLE)[0], curve.seconds[-1])
             return seconds, np.array([curve.errors[-1]])
         start = time.process_time()
-        found = searched(
-            self.job.rates,
-            self.job.samples,
-            lambda rate, spp, budget: self._run(method, rate, spp, self.SEARCH_SEED, MIDDLE, budget),
-            self.job.budget,
+        self.curves[method] = list(
+            searched(
+                self.job.rates,
+                self.job.samples,
+                lambda rate, spp, budget: self._run(method, rate, spp, self.SEARCH_SEED, MIDDLE, budget),
+                self.job.budget,
+            )
         )
-        self.curves[method] = [replace(curve, searched=True) for curve in found]
-        return time.process_time() - start, np.array([best(self.curves[method]).errors[-1]])
+        return time.process_time() - start, np.array([best(self.curves[method], MIDDLE).errors[-1]])
 
     def forget(self) -> None:
         """Nothing: what the search has found is kept."""

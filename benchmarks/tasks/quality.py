@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from ..inverse.loops import entries_of
 from ..inverse.problems import PROBLEMS
-from ..inverse.search import MARKS, best, reached
+from ..inverse.search import MARKS, MIDDLE, best, reached
 from ..measures.job import Curve, Job, Point, Record
 from ..measures.methods import STOCK, parts
 from ..tables import groups, markdown
@@ -18,7 +18,7 @@ TAKES = (90, 1200)
 QUICK = "texture under a sky", "room: two lamps, four materials", "cloud"
 RATES, SAMPLES = (0.001, 0.003, 0.01, 0.03), (4, 32)
 QUICK_RATES, QUICK_SAMPLES = (0.01, 0.03), (8,)
-SECONDS, HEAVY_SECONDS, QUICK_SECONDS = 4.0, 8.0, 1.0
+SECONDS, QUICK_SECONDS = 8.0, 1.0
 
 
 def jobs(quick: bool) -> list[Job]:
@@ -36,7 +36,7 @@ def jobs(quick: bool) -> list[Job]:
             warmup=1,
             threads=1,
             measure="quality",
-            budget=QUICK_SECONDS if quick else HEAVY_SECONDS if PROBLEMS[name].heavy else SECONDS,
+            budget=QUICK_SECONDS if quick else SECONDS,
             rates=QUICK_RATES if quick else RATES,
             samples=QUICK_SAMPLES if quick else SAMPLES,
         )
@@ -49,35 +49,50 @@ def is_stock(point: Point) -> bool:
     return parts(point.method)[0] in STOCK
 
 
-def runs(point: Point) -> list[Curve]:
-    """The optimisations with the chosen rate and samples, one for each seed."""
-    return [curve for curve in point.curves if not curve.searched]
+def choice(point: Point, mark: float = MIDDLE) -> Curve:
+    """The point of the grid that the search has chosen for a mark."""
+    return best(point.curves, mark)
+
+
+def runs(point: Point, mark: float = MIDDLE) -> list[Curve]:
+    """The optimisations with the rate and the samples that were chosen for a mark, one for each seed."""
+    chosen = choice(point, mark)
+    return [
+        curve for curve in point.curves if not curve.searched and (curve.rate, curve.spp) == (chosen.rate, chosen.spp)
+    ]
 
 
 def table(record: Record) -> str:
-    """A row for each loop: chosen rate and samples, medians over seeds, and the ratio to the best plain loop."""
-    header = ["problem", "loop", "rate", "spp", *(f"1/{1 / mark:.0f}, s" for mark in MARKS)]
-    header += ["1/10, iterations", "time / best plain loop", "last error / first", "first iterations, s"]
+    """A row for each loop: chosen rates and samples, medians over seeds, and the ratio to the best plain loop."""
+    header = ["problem", "loop", *(cell for mark in MARKS for cell in _headings(mark)), "1/10, iterations"]
+    header += ["time / best plain loop", "last error / first", "first iterations, s"]
     return markdown(header, [row for points in groups(record.points).values() for row in _rows(points)])
+
+
+def _headings(mark: float) -> list[str]:
+    """Column headings of a mark. Marks below the middle one have no choice of their own."""
+    name = f"1/{1 / mark:.0f}"
+    return [f"{name}: rate, spp", f"{name}, s"] if mark >= MIDDLE else [f"{name}, s"]
+
+
+def _cells(point: Point, mark: float) -> list[str]:
+    chosen, seconds = choice(point, mark), _cell(_median(point, mark)[0], ".2f")
+    return [f"{chosen.rate:g}, {chosen.spp}", seconds] if mark >= MIDDLE else [seconds]
 
 
 def _rows(points: Mapping[str, Point]) -> list[list[str]]:
     rows = []
     for point in points.values():
-        if point.error or not runs(point):
+        if point.error or not point.curves:
             rows.append([point.scene, point.method, f"raises: {_short(point.error or '')}", *[""] * 8])
             continue
-        choice = best([curve for curve in point.curves if curve.searched])
         errors = st.median(curve.errors[-1] / curve.errors[0] for curve in runs(point))
-        cells = [_cell(_median(point, mark)[0], ".2f") for mark in MARKS]
         rows.append(
             [
                 point.scene,
                 point.method,
-                f"{choice.rate:g}",
-                str(choice.spp),
-                *cells,
-                _cell(_median(point, MARKS[1])[1], ".0f"),
+                *(cell for mark in MARKS for cell in _cells(point, mark)),
+                _cell(_median(point, MIDDLE)[1], ".0f"),
                 _ratio(point, points),
                 f"{errors:.3f}",
                 f"{max(curve.warm_up for curve in point.curves):.1f}",
@@ -92,7 +107,9 @@ def _short(error: str) -> str:
 
 def _median(point: Point, mark: float) -> tuple[float, float]:
     """Seconds and iterations until the mark, medians over seeds; infinite if most seeds never reach it."""
-    return tuple(st.median(values) for values in zip(*(reached(curve, mark) for curve in runs(point)), strict=True))
+    return tuple(
+        st.median(values) for values in zip(*(reached(curve, mark) for curve in runs(point, mark)), strict=True)
+    )
 
 
 def _cell(value: float, form: str) -> str:
@@ -101,7 +118,7 @@ def _cell(value: float, form: str) -> str:
 
 def _ratio(point: Point, points: Mapping[str, Point]) -> str:
     """Time relative to the fastest plain loop, at the smallest mark that both reach."""
-    plain = [other for other in points.values() if is_stock(other) and runs(other)]
+    plain = [other for other in points.values() if is_stock(other) and other.curves]
     for mark in reversed(MARKS):
         times = [_median(other, mark)[0] for other in plain]
         own = _median(point, mark)[0]

@@ -172,7 +172,7 @@ def test_it_goes_on_bit_for_bit_from_everywhere(noise: float) -> None:
         rest = go(other, points[done], 60 - done, noise=noise)
         assert [bits(p) for p in rest] == [bits(p) for p in points[done + 1 :]]
         if rest and not noise:
-            assert bits(other.answer()) == bits(points[-1]) or other.answer() == {}
+            assert bits(other.answer({})) == bits(points[-1]) or other.answer({}) == {}
 
 
 def test_a_state_that_does_not_fit_is_refused() -> None:

@@ -75,8 +75,8 @@ def test_what_it_comes_to_is_the_best_point() -> None:
     optimiser = search()
     points = [START, *go(optimiser, START, 12)]
     losses = [valley(point)[0] for point in points[:-1]]
-    assert bits(optimiser.answer()) == bits(points[int(np.argmin(losses))])
-    assert search().answer() == {}
+    assert bits(optimiser.answer({})) == bits(points[int(np.argmin(losses))])
+    assert search().answer({}) == {}
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_it_goes_on_bit_for_bit_from_everywhere() -> None:
         assert other.finished == optimiser.finished
         rest = go(other, points[done], 1000)
         assert [bits(p) for p in rest] == [bits(p) for p in points[done + 1 :]]
-        assert bits(other.answer()) == bits(points[-1])
+        assert bits(other.answer({})) == bits(points[-1])
 
 
 def test_a_state_that_does_not_fit_is_refused() -> None:

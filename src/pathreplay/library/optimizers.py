@@ -63,7 +63,7 @@ class OfMitsuba:
         optimizer.step()
         return {key: np.array(dr.detach(optimizer[key])).reshape(value.shape) for key, value in values.items()}
 
-    def answer(self) -> dict[str, Array]:
+    def answer(self, values: Arrays) -> dict[str, Array]:
         """See `Optimiser`."""
         return {}
 
@@ -131,7 +131,7 @@ class OfUser:
             self._steps[key] += 1
         return stepped
 
-    def answer(self) -> dict[str, Array]:
+    def answer(self, values: Arrays) -> dict[str, Array]:
         """See `Optimiser`."""
         return {}
 

@@ -20,6 +20,9 @@ class Optimizer(Table):
 
     type: Literal["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b", "levenberg-marquardt"] = "adam"
     """Optimiser of drjit.opt, SciPy's L-BFGS-B, or Levenberg-Marquardt for up to 200 numbers."""
+    iterate_averaging: Switch | None = None
+    """Lower the noise of the result by a mean of recent iterates, except for values that still move steadily (Adam,
+    AdamW, SGD, RMSProp; default: true)."""
     beta_1: Share | None = None
     """Decay rate of the first moment (Adam, AdamW)."""
     beta_2: Share | None = None
@@ -85,12 +88,13 @@ _ADAM = {
     "epsilon": 1e-8,
     "uniform": False,
     "amsgrad": False,
+    "iterate_averaging": True,
 }
 DEFAULTS: dict[str, dict[str, float | bool]] = {
     "adam": _ADAM,
     "adamw": {**_ADAM, "weight_decay": 0.01},
-    "sgd": {"momentum": 0.0, "nesterov": False},
-    "rmsprop": {"alpha": 0.99, "epsilon": 1e-8},
+    "sgd": {"momentum": 0.0, "nesterov": False, "iterate_averaging": True},
+    "rmsprop": {"alpha": 0.99, "epsilon": 1e-8, "iterate_averaging": True},
     # The tolerance is relative to the initial loss. Smaller decreases are within the rounding error of float32.
     "l-bfgs-b": {"history_size": 10, "tolerance": 1e-6},
     "levenberg-marquardt": {"damping": 1e-2, "tolerance": 0.0},

@@ -46,6 +46,7 @@ from pathreplay.inverse.objective.evaluate import (
 )
 from pathreplay.inverse.objective.stages import Part, part_at
 from pathreplay.inverse.optim.adaptive import DrJitOptimiser, Optimiser
+from pathreplay.inverse.optim.averaging import Averaged
 from pathreplay.inverse.optim.lbfgs import LineSearch, Search
 from pathreplay.inverse.optim.levenberg_marquardt import LevenbergMarquardt
 from pathreplay.inverse.parameters.exposures import EXPOSURE, exposed, with_held_out
@@ -103,12 +104,16 @@ def optimiser_of(problem: Problem, values: Arrays, options: Optimizer, search: S
             return LevenbergMarquardt(values, options, bounds)
         return LineSearch(values, options, bounds, search)
     uniform = [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
-    return DrJitOptimiser(values, options, uniform)
+    optimiser = DrJitOptimiser(values, options, uniform)
+    return Averaged(optimiser) if options.options()["iterate_averaging"] else optimiser
 
 
 def best_values(problem: Problem, run: Run) -> dict[str, Array]:
-    """Return the resulting values of a run: the values after its last step, or the best values of a line search."""
-    best = run.optimiser.answer()
+    """Return the resulting values of a run, which may differ from the values after its last step.
+
+    They differ if the optimiser compares losses or averages its iterates (see `Optimiser.answer`).
+    """
+    best = run.optimiser.answer(latents(problem.variables, run.values))
     for v in problem.variables:
         if v.coordinates and v.key in best:
             best[v.key] = v.coordinates.values(best[v.key])
@@ -151,7 +156,7 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
             # Measure the image errors after the first iteration, and after each tenth of all iterations.
             if i == 0 or JUDGEMENTS * i // config.iterations < JUDGEMENTS * (i + 1) // config.iterations:
                 for measured in (run, baseline):
-                    error = image_error(problem, measured.values, i)
+                    error = image_error(problem, best_values(problem, measured), i)
                     measured.history[-1] = replace(measured.history[-1], picture_error=error)
         for key, ratio in noise.ratios(run.history).items():
             if ratio < noise.FAINT and key not in faint:
@@ -358,11 +363,9 @@ def _plain(problem: Problem, view: View, spp: int) -> Image:
 
 
 def ended(problem: Problem, run: Run) -> Run:
-    """Return a copy of the run with `best_values`. In the copy and its baseline, fit the exposures of test views."""
-    run = replace(run, values=best_values(problem, run))
-    for each in filter(None, (run, run.baseline)):
-        each.values = dict(with_exposures(problem, each.values))
-    return run
+    """Return a copy of the run and its baseline with `best_values`, and fit the exposures of test views."""
+    baseline = run.baseline and ended(problem, run.baseline)
+    return replace(run, values=dict(with_exposures(problem, best_values(problem, run))), baseline=baseline)
 
 
 def with_exposures(problem: Problem, values: Arrays) -> Arrays:

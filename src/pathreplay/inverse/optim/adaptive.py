@@ -57,8 +57,12 @@ class Optimiser(Protocol):
             loss: loss at the values, for optimisers that need it.
         """
 
-    def answer(self) -> dict[str, Array]:
-        """Return the best values so far, or an empty dictionary if the values after the last step are the best."""
+    def answer(self, values: Arrays) -> dict[str, Array]:
+        """Return the best values so far. Variables that are missing have their best values after the last step.
+
+        Args:
+            values: values after the last step.
+        """
 
     def state(self) -> State:
         """Return all state that later steps depend on, besides the values."""
@@ -87,6 +91,7 @@ class DrJitOptimiser:
         self._moments = wanted.type not in _KEPT  # Adam and AdamW
         self._names = _MOMENTS if self._moments else _KEPT[wanted.type]
         given = wanted.options()
+        del given["iterate_averaging"]  # see `averaging`
         self._everywhere, self._uniform = given.pop("uniform", False), frozenset(uniform if self._moments else ())
         self._parts = {
             even: _CLASSES[wanted.type](1.0, None, **given, **({"uniform": even} if self._moments else {}))
@@ -154,7 +159,7 @@ class DrJitOptimiser:
             part.state = known
         return stepped
 
-    def answer(self) -> dict[str, Array]:
+    def answer(self, values: Arrays) -> dict[str, Array]:
         """See `Optimiser`."""
         return {}
 

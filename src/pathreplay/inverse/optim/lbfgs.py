@@ -82,14 +82,14 @@ class LineSearch:
     ) -> dict[str, Array]:
         """See `Optimiser`. Returns the next point to evaluate, or the best point if the search has finished."""
         if self.finished:
-            return self.answer()
+            return self.answer(values)
         if not self._losses:
             self._scale = np.concatenate([np.full(value.size, rates[key]) for key, value in values.items()])
             self._start = _flat(values) / self._scale
         self._losses.append(float(loss))
         self._gradients.append(_flat({key: gradients[key] for key in values}) * self._scale)
         self._ask()
-        return self.answer() if self.finished else self._split(self._next)
+        return self.answer(values) if self.finished else self._split(self._next)
 
     def _ask(self) -> None:
         """Run the minimiser on the recorded evaluations, until it requests a new evaluation or finishes."""
@@ -129,7 +129,7 @@ class LineSearch:
             at += n
         return parts
 
-    def answer(self) -> dict[str, Array]:
+    def answer(self, values: Arrays) -> dict[str, Array]:
         """Return the point with the lowest loss so far, or an empty dictionary before the first step."""
         return self._split(self._points[int(np.argmin(self._losses))]) if self._losses else {}
 

@@ -143,7 +143,7 @@ class LevenbergMarquardt:
         seen = Point(at, loss - model.excess, gradient, model)
         self._steps += 1
         if self.finished:
-            return self.answer()
+            return self.answer(values)
         if self._count:
             self._average(seen)
         else:
@@ -271,7 +271,7 @@ class LevenbergMarquardt:
             for (key, shape), part in zip(self._shapes.items(), parts, strict=True)
         }
 
-    def answer(self) -> dict[str, Array]:
+    def answer(self, values: Arrays) -> dict[str, Array]:
         """Return the last accepted point of a search; an empty dictionary before the first step and while averaging."""
         if self._base is None or (self._count and not self.finished):
             return {}
