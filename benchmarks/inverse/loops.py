@@ -214,6 +214,7 @@ ENTRIES: dict[str, Entry] = {
     **{f"{name}, plain loop": plain(name) for name in ("prb", "prbvolpath", "prb_projective")},
     "path, central difference": differences("path"),
     "pathreplay": own(),
+    "pathreplay, last iterate": own(optimizer={"type": "adam", "iterate_averaging": False}),
     "pathreplay, pyramid": own(of_grids={"pyramid": True}),
     "pathreplay, Levenberg-Marquardt": own(few=True, optimizer="levenberg-marquardt", view_batch_size=None),
 }

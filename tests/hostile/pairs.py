@@ -133,7 +133,15 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
     "parameters.shape": [_SHARE],
     **_of("exposure", white_balance=[True], reference=["left"], fix_scale=[False], learning_rate=[0.1]),
     **_of("adaptive_spp", {"spp": "auto"}, target_snr=[0.5], min=[4], max=[16]),
-    **_of("optimizer", beta_1=[0.8], beta_2=[0.9], epsilon=[1e-6], uniform=[True], amsgrad=[True]),
+    **_of(
+        "optimizer",
+        beta_1=[0.8],
+        beta_2=[0.9],
+        epsilon=[1e-6],
+        uniform=[True],
+        amsgrad=[True],
+        iterate_averaging=[False],
+    ),
     "optimizer.type": [
         {"optimizer.type": kind} for kind in ("adamw", "sgd", "rmsprop", "l-bfgs-b", "levenberg-marquardt")
     ],

@@ -57,7 +57,7 @@ FINER = [{"key": TEXTURE, "initial": 0.5, "lower": 0.0, "upper": 1.0, "resolutio
 
 
 def test_refined_grid_ends_in_its_last_resolution_with_the_truth_in_another() -> None:
-    result = run(iterations=40, spp=8, parameters=FINER)
+    result = run(iterations=40, spp=8, parameters=FINER, optimizer={"iterate_averaging": False})
     assert result.parameters[TEXTURE].shape == (4, 4, 3)
     # Start 0.5, truth 2 x 2 texels from 0.06 to 0.9; what is left is noise (see test_recovers_texture_and_colour), more
     # of it than there, for 16 texels share the pixels of 4.

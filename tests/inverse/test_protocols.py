@@ -11,6 +11,7 @@ import pytest
 from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Executor, Local, Shard, total
 from pathreplay.inverse.optim.adaptive import DrJitOptimiser, Optimiser
+from pathreplay.inverse.optim.averaging import Averaged
 from small_job import bits
 
 Make = Callable[..., Optimiser]
@@ -23,6 +24,7 @@ OPTIMISERS = {
     "nesterov": {"type": "sgd", "momentum": 0.5, "nesterov": True},
     "rmsprop": {"type": "rmsprop", "alpha": 0.9},
 }
+AVERAGED = {"adam, averaged": {}, "sgd, averaged": {"type": "sgd"}}
 EXECUTORS = [Local]
 
 GOAL = {"colour": np.float32([0.2, -0.4, 0.9]), "grid": np.linspace(-1, 1, 24, dtype=np.float32).reshape(2, 3, 4, 1)}
@@ -30,9 +32,11 @@ RATES = {"colour": 0.05, "grid": 0.1}
 Arrays = dict[str, np.ndarray]
 
 
-@pytest.fixture(params=OPTIMISERS)
+@pytest.fixture(params=[*OPTIMISERS, *AVERAGED])
 def make(request: pytest.FixtureRequest) -> Make:
-    return partial(DrJitOptimiser, options=Optimizer(**OPTIMISERS[request.param]))
+    if request.param in OPTIMISERS:
+        return partial(DrJitOptimiser, options=Optimizer(**OPTIMISERS[request.param]))
+    return lambda values: Averaged(DrJitOptimiser(values, Optimizer(**AVERAGED[request.param])))
 
 
 def start() -> Arrays:

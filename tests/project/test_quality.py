@@ -138,11 +138,25 @@ def descended(rate: float, budget: float = 1000, goal: float = 1e-3) -> Curve:
 def test_the_search_picks_the_rate_that_reaches_the_middle_mark_first() -> None:
     curves = list(searched((0.01, 0.1), (4, 8), lambda rate, spp, budget: descended(rate * spp / 8, budget), 1000))
     assert [(curve.rate, curve.spp) for curve in curves] == [(0.01, 4), (0.1, 4), (0.01, 8), (0.1, 8)]
-    assert (best(curves).rate, best(curves).spp) == (0.1, 8)
+    assert {(best(curves, mark).rate, best(curves, mark).spp) for mark in MARKS} == {(0.1, 8)}
     assert curves[2].seconds[-1] < reached(curves[1], MIDDLE)[0] + 1.01, "it is stopped once it cannot be the best"
-    late = [replace(descended(rate, budget=3), rate=rate) for rate in (0.2, 0.3, 0.1)]
+    late = [replace(descended(rate, budget=3), rate=rate, searched=True) for rate in (0.2, 0.3, 0.1)]
     assert {reached(curve, MARKS[1])[0] for curve in late} == {math.inf}
-    assert best(late).rate == 0.3, "where none reaches it, the last error decides"
+    assert best(late, MARKS[1]).rate == 0.3, "where none reaches it, the last error decides"
+
+
+def test_each_mark_has_its_own_choice() -> None:
+    """A fast rate reaches the first mark, and then stays at its noise; a slow one reaches the second mark."""
+    times = tuple(float(n) for n in range(6))
+    known = {"spp": 4, "seed": 0, "steps": tuple(range(6)), "seconds": times, "searched": True}
+    fast = Curve(rate=0.1, errors=(1, 0.3, 0.2, 0.2, 0.2, 0.2), **known)
+    slow = Curve(rate=0.01, errors=(1, 0.8, 0.5, 0.3, 0.2, 0.09), **known)
+    assert [best([fast, slow], mark).rate for mark in MARKS] == [0.1, 0.01, 0.01]
+    runs = [replace(curve, searched=False, seed=1) for curve in (fast, slow)]
+    both = point("pathreplay", 0.1, curves=(fast, slow, *runs))
+    assert [[curve.rate for curve in quality.runs(both, mark)] for mark in MARKS] == [[0.1], [0.01], [0.01]]
+    cells = quality.table(record(both)).splitlines()[-1].split("|")[3:8]
+    assert [cell.strip() for cell in cells] == ["0.1, 4", "0.91", "0.01, 4", "4.87", "not reached"]
 
 
 def test_marks_are_interpolated_and_budgets_are_kept() -> None:
@@ -167,11 +181,11 @@ def test_each_problem_has_a_plain_loop_and_ours() -> None:
 
 
 def point(method: str, rate: float, **more: Any) -> Point:
-    curves = (replace(descended(rate), rate=0.01, spp=4, searched=True), replace(descended(rate), seed=1))
+    curve = replace(descended(rate), rate=0.01, spp=4)
+    curves = replace(curve, searched=True), replace(curve, seed=1)
     known = {"scene": "cloud", "parameters": (), "max_depth": 0, "paths": 1, "measure": "quality", "peak_mib": None}
-    return Point(
-        method=method, seeds=(0,), seconds=(1.0,), squared_errors=(), not_finite=(), curves=curves, **known | more
-    )
+    known |= {"seeds": (0,), "seconds": (1.0,), "squared_errors": (), "not_finite": (), "curves": curves}
+    return Point(method=method, **known | more)
 
 
 def record(*points: Point) -> Record:
@@ -185,7 +199,8 @@ def test_the_table_compares_with_the_best_plain_loop() -> None:
     lines = quality.table(record(slow, fast, point("pathreplay", 0.19), failed)).splitlines()[2:]
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
     assert [row[8] for row in cells] == ["2.05 at 1/30", "1.00 at 1/30", "0.50 at 1/30", ""]
-    assert cells[2][4:8] == ["5.21", "10.93", "16.14", "11"] and cells[3][2] == "raises: not attached"
+    assert cells[2][2:8] == ["0.01, 4", "5.21", "0.01, 4", "10.93", "16.14", "11"]
+    assert cells[3][2] == "raises: not attached"
     still = point("pathreplay", 0.0)
     still = replace(still, curves=tuple(replace(descended(0.0, budget=5), searched=s) for s in (True, False)))
     assert "not reached" in quality.table(record(fast, still)).splitlines()[-1]

@@ -30,6 +30,8 @@ from pathreplay.inverse.parameters.values import Array, Arrays
 
 SHORT, LONG = 8, 3
 """Exponents η of the two means."""
+MOST = 2**24
+"""Maximum number of entries of an averaged variable. The means of larger variables would take too much memory."""
 _SHORT, _LONG, _SCATTER = "short:", "long:", "scatter:"
 
 
@@ -60,7 +62,8 @@ class _Means:
 class Averaged:
     """An optimiser whose result is the combination of its last iterate with a mean of recent iterates.
 
-    The steps are those of the given optimiser. Each variable has its own combination.
+    The steps are those of the given optimiser. Each variable has its own combination; variables of more than `MOST`
+    entries have none.
     """
 
     finished = ""
@@ -74,6 +77,9 @@ class Averaged:
     ) -> dict[str, Array]:
         """See `Optimiser`. From the second step of a variable on, its means include the given values."""
         for key, value in values.items():
+            if value.size > MOST:
+                self._means.pop(key, None)
+                continue
             known = self._means.get(key)
             same = known is not None and known.short.shape == value.shape
             self._means[key] = known.after(value) if known is not None and same else _Means(value.copy(), value.copy())
@@ -104,7 +110,7 @@ class Averaged:
         self._optimiser.restore(State(state.steps, rest), values)
         self._means = {}
         for key, count in state.steps.items():
-            if not count:
+            if not count or values[key].size > MOST:
                 continue
             short, long, scatter = (np.array(state.arrays[what + key]) for what in own)
             for mean in (short, long):

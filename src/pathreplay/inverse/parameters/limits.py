@@ -15,9 +15,10 @@ from pathreplay.inverse.config.parameter_options import Parameter
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.platform import memory
 
-# Bytes per optimised number, for ten floats: the old value, the new value, the copy in Dr.Jit, the gradient, the sum of
-# gradients, Adam's two moments, two means of iterates and a temporary.
-_A_VALUE = 40
+# Bytes per optimised number, for eight floats: the old value, the new value, the copy in Dr.Jit, the gradient, the sum
+# of gradients, Adam's two moments and a temporary. The means of iterate averaging are not counted, because larger
+# variables have none.
+_A_VALUE = 32
 # Largest ratio of a learning rate to the values. The learning rate is about the length of Adam's steps.
 _LONGEST_STEP = 1e6
 # Largest ratio of a pivot or displacement to the extent of the scene.
