@@ -117,11 +117,20 @@ def _cell(value: float, form: str) -> str:
 
 
 def _ratio(point: Point, points: Mapping[str, Point]) -> str:
-    """Time relative to the fastest plain loop, at the smallest mark that both reach."""
+    """Time relative to the fastest plain loop, at the smallest mark that both reach, and bounds at smaller marks.
+
+    A plain loop that has not reached a mark needs more than all its seconds.
+    """
     plain = [other for other in points.values() if is_stock(other) and other.curves]
-    for mark in reversed(MARKS):
+    cells: list[str] = []
+    for mark in MARKS:
+        own, name = _median(point, mark)[0], f"at 1/{1 / mark:.0f}"
+        if not plain or not math.isfinite(own):
+            break
         times = [_median(other, mark)[0] for other in plain]
-        own = _median(point, mark)[0]
-        if times and math.isfinite(own) and math.isfinite(min(times)):
-            return f"{own / min(times):.2f} at 1/{1 / mark:.0f}"
-    return ""
+        if math.isfinite(min(times)):
+            cells = [f"{own / min(times):.2f} {name}"]
+        else:
+            spent = min(curve.seconds[-1] for other in plain for curve in runs(other, mark))
+            cells += [f"< {own / spent:.2f} {name}"] if own < spent else []
+    return "; ".join(cells)

@@ -201,6 +201,9 @@ def test_the_table_compares_with_the_best_plain_loop() -> None:
     assert [row[8] for row in cells] == ["2.05 at 1/30", "1.00 at 1/30", "0.50 at 1/30", ""]
     assert cells[2][2:8] == ["0.01, 4", "5.21", "0.01, 4", "10.93", "16.14", "11"]
     assert cells[3][2] == "raises: not attached"
+    short = replace(fast, curves=tuple(replace(descended(0.1, budget=12), searched=s) for s in (True, False)))
+    last = quality.table(record(short, point("pathreplay", 0.19))).splitlines()[-1].split("|")[9]
+    assert last.strip() == "0.50 at 1/3; < 0.91 at 1/10", "the plain loop stopped after 12 s"
     still = point("pathreplay", 0.0)
     still = replace(still, curves=tuple(replace(descended(0.0, budget=5), searched=s) for s in (True, False)))
     assert "not reached" in quality.table(record(fast, still)).splitlines()[-1]
