@@ -19,7 +19,7 @@ iterates fluctuate, and equals the last iterate if they move steadily.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -32,10 +32,12 @@ SHORT, LONG = 8, 3
 """Exponents η of the two means."""
 MOST = 2**24
 """Maximum number of entries of an averaged variable. The means of larger variables would take too much memory."""
+BLOCK = 2**16
+"""Number of entries that are processed at once, so that temporary arrays stay in the processor's cache."""
 _SHORT, _LONG, _SCATTER = "short:", "long:", "scatter:"
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Means:
     """Means over the iterates of one variable. Before the first iterate, they are the initial value."""
 
@@ -46,17 +48,36 @@ class _Means:
     count: int = 0
     """Number of iterates."""
 
-    def after(self, x: Array) -> _Means:
-        """Return the means that include one more iterate."""
-        n = self.count + 1
-        short, long = (_between(old, x, _weight(eta, n)) for old, eta in ((self.short, SHORT), (self.long, LONG)))
-        scatter = self.scatter + _weight(SHORT, n) * (_square(x - short) - self.scatter)
-        return _Means(short, long, scatter, n)
+    def add(self, x: Array) -> None:
+        """Include one more iterate."""
+        self.scatter, _ = self._ahead(x, store=True)
+        self.count += 1
 
     def combined(self, x: Array) -> Array:
-        """Return the combination of the short mean with the last iterate ``x``, which the means include."""
-        lag = _square(self.long - self.short)
-        return _between(x, self.short, 1 - lag / self.scatter) if lag < self.scatter else x
+        """Return the combination of the last iterate ``x`` with the short mean that includes it."""
+        scatter, lag = self._ahead(x)
+        if lag >= scatter:
+            return x
+        # With x included, the distance of the short mean from x shrinks by the factor 1 - w.
+        share = np.float32((1 - lag / scatter) * (1 - _weight(SHORT, self.count + 1)))
+        found = np.array(x, order="C")
+        for value, short in _blocks(found, self.short):
+            value += share * (short - value)
+        return found
+
+    def _ahead(self, x: Array, store: bool = False) -> tuple[float, float]:
+        """Return s and d for the means that include the iterate ``x``. If ``store`` is set, store these means."""
+        n, scatter, lag = self.count + 1, 0.0, 0.0
+        a, b = (np.float32(1 - _weight(eta, n)) for eta in (SHORT, LONG))
+        for value, short, long in _blocks(x, self.short, self.long):
+            near, far = a * (short - value), b * (long - value)
+            if store:
+                np.add(value, near, out=short)
+                np.add(value, far, out=long)
+            far -= near
+            scatter += float(near @ near)
+            lag += float(far @ far)
+        return self.scatter + _weight(SHORT, n) * (scatter - self.scatter), lag
 
 
 class Averaged:
@@ -81,14 +102,16 @@ class Averaged:
                 self._means.pop(key, None)
                 continue
             known = self._means.get(key)
-            same = known is not None and known.short.shape == value.shape
-            self._means[key] = known.after(value) if known is not None and same else _Means(value.copy(), value.copy())
+            if known is not None and known.short.shape == value.shape:
+                known.add(value)
+            else:
+                self._means[key] = _Means(np.array(value, order="C"), np.array(value, order="C"))
         return self._optimiser.step(values, gradients, rates, loss)
 
     def answer(self, values: Arrays) -> dict[str, Array]:
         """See `Optimiser`."""
         return {
-            key: means.after(values[key]).combined(values[key])
+            key: means.combined(values[key])
             for key, means in self._means.items()
             if means.short.shape == values[key].shape
         }
@@ -99,7 +122,7 @@ class Averaged:
         makers = {name: partial(state.arrays.__getitem__, name) for name in state.arrays}
         for key, means in self._means.items():
             own = {_SHORT: means.short, _LONG: means.long, _SCATTER: np.array([means.scatter])}
-            makers |= {what + key: partial(_itself, array) for what, array in own.items()}
+            makers |= {what + key: partial(np.copy, array) for what, array in own.items()}
         return State(state.steps, WhenAsked(makers))
 
     def restore(self, state: State, values: Arrays) -> None:
@@ -126,17 +149,8 @@ def _weight(eta: int, n: int) -> float:
     return (eta + 1) / (n + eta)
 
 
-def _between(a: Array, b: Array, share: float) -> Array:
-    """Return a + share (b - a) with a single temporary array."""
-    found: Array = b - a
-    found *= np.float32(share)
-    found += a
-    return found
-
-
-def _square(difference: Array) -> float:
-    return float(np.vdot(difference, difference))
-
-
-def _itself(array: Array) -> Array:
-    return array
+def _blocks(*arrays: Array) -> Iterator[tuple[Array, ...]]:
+    """Yield flat views of at most `BLOCK` entries of C-contiguous arrays of equal size."""
+    flat = [array.reshape(-1) for array in arrays]
+    for begin in range(0, flat[0].size, BLOCK):
+        yield tuple(array[begin : begin + BLOCK] for array in flat)
