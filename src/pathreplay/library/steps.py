@@ -59,7 +59,7 @@ class State:
     """State of an optimisation, immutable: `step` returns the next one."""
 
     values: Mapping[str, Array]
-    """Values by name. Search methods such as ``l-bfgs-b`` give the best values so far."""
+    """Values by name, which are the best estimate so far, not always the values of the next evaluation."""
     history: tuple[Entry, ...]
     """One entry per step: loss, seconds, gradient norms and more."""
     finished: str
