@@ -31,7 +31,7 @@ class Iteration:
     entry: Entry
     """Entry of the history."""
     values: Mapping[str, Array]
-    """Values that would be the result if the run ended now, by name. A pose has ``KEY:translation`` and ``KEY:rotation``."""
+    """Values by name, as if the run ended now. A pose has ``KEY:translation`` and ``KEY:rotation``."""
     views: tuple[str, ...]
     """Names of the views."""
     folder: Path | None
