@@ -14,7 +14,7 @@ from ..measures.methods import STOCK, parts
 from ..tables import groups, markdown
 
 TITLE = "quality"
-TAKES = (90, 1200)
+TAKES = (90, 3400)
 QUICK = "texture under a sky", "room: two lamps, four materials", "cloud"
 RATES, SAMPLES = (0.001, 0.003, 0.01, 0.03), (4, 32)
 QUICK_RATES, QUICK_SAMPLES = (0.01, 0.03), (8,)
@@ -56,6 +56,8 @@ def choice(point: Point, mark: float = MIDDLE) -> Curve:
 
 def runs(point: Point, mark: float = MIDDLE) -> list[Curve]:
     """The optimisations with the rate and the samples that were chosen for a mark, one for each seed."""
+    if not point.curves:  # the loop has raised an error
+        return []
     chosen = choice(point, mark)
     return [
         curve for curve in point.curves if not curve.searched and (curve.rate, curve.spp) == (chosen.rate, chosen.spp)

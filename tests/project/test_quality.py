@@ -210,7 +210,8 @@ def test_the_table_compares_with_the_best_plain_loop() -> None:
 
 
 def test_curves_are_drawn() -> None:
-    figure = plots.DRAW["quality-curves"](record(point("prb, plain loop", 0.1), point("pathreplay", 0.2)))
+    failed = replace(point("prb_projective, plain loop", 0.1), error="not attached", curves=())
+    figure = plots.DRAW["quality-curves"](record(failed, point("prb, plain loop", 0.1), point("pathreplay", 0.2)))
     lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
     assert {"prb, plain loop", "pathreplay"} <= set(lines)
     assert lines["pathreplay"].get_ydata()[0] == pytest.approx(0.8)
