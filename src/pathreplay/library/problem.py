@@ -229,6 +229,8 @@ class Problem:
         config.model_fields_set.update(changes)
         config.__dict__["learning_rate_schedule"] = checked.learning_rate_schedule
         built = replace(self.built, config=config)
+        if isinstance(built, inner_joint.JointProblem):
+            built = replace(built, parts=tuple(replace(part, config=config) for part in built.parts))
         require_possible(built)
         return built
 

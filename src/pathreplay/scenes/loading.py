@@ -79,11 +79,17 @@ def load_scene_with(
 
 
 def _copied(description: Mapping[str, object]) -> SceneDict:
-    """Copy a dictionary and its tensors, because Mitsuba moves tensors out of a dictionary that it loads."""
-    return {
-        name: _copied(value) if isinstance(value, Mapping) else type(value)(value) if dr.is_array_v(value) else value
-        for name, value in description.items()
-    }
+    """Copy a dictionary, its tensors and its bitmaps.
+
+    When Mitsuba loads a dictionary, it moves the tensors out of it, and converts bitmaps in place in spectral variants.
+    """
+
+    def copied(value: object) -> object:
+        if isinstance(value, Mapping):
+            return _copied(value)
+        return type(value)(value) if dr.is_array_v(value) or isinstance(value, mi.Bitmap) else value
+
+    return {name: copied(value) for name, value in description.items()}
 
 
 def as_xml_has_them(parameters: Mapping[str, object]) -> dict[str, str]:

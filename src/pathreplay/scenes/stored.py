@@ -119,9 +119,13 @@ class Spectra(Form):
     def store(self, seen: SceneValue) -> SceneValue:
         S = mi.Vector3f(*_entries(seen, 3))
         # As in Mitsuba, S is scaled so that its largest entry is one half, because spectra with moderate values are
-        # smooth.
-        factor = dr.maximum(2 * dr.max(S), 1e-8) if self.scaled else mi.Float(1)
-        x = 2 * dr.clip(S / factor, _MARGIN, 1 - _MARGIN) - 1
+        # smooth. Derivatives pass through the limits: a colour that a bound has set to 0 or 1 can leave it again.
+        factor = mi.Float(1)
+        if self.scaled:
+            doubled = 2 * dr.max(S)
+            factor = dr.replace_grad(dr.maximum(doubled, 1e-8), doubled)
+        share = S / factor
+        x = 2 * dr.replace_grad(dr.clip(share, _MARGIN, 1 - _MARGIN), share) - 1
         p = x * dr.rsqrt(1 - dr.square(x))
         c = [sum(float(a) * p[i] for i, a in enumerate(row)) for row in TO_COEFFICIENTS]
         stored = _like(seen, mi.Vector4f(*c, factor) if self.scaled else mi.Vector3f(*c))

@@ -303,7 +303,8 @@ class Config(Table):
                 f"debias: loss = '{self.loss}' is not smooth where image and target are equal, so that extrapolation "
                 "does not remove its bias; remove 'debias', or use a smooth loss such as 'log'"
             )
-        numbers = [self.spp, self.adaptive_spp.min] + [stage.spp for stage in self.stages or []]
+        first = self.adaptive_spp.min if self.spp == AUTO else self.spp
+        numbers = [first, *(stage.spp for stage in self.stages or [])]
         if any(isinstance(spp, int) and spp < 2 * self.parts for spp in numbers):
             raise ValueError(
                 f"debias: the loss is evaluated at two halves of the samples; set spp to {2 * self.parts} or more"

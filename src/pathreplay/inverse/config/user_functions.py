@@ -26,7 +26,7 @@ DEEPEST = 8
 """Deepest nesting of lists in a return value."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # the function may be an object without a hash
 class Imported:
     """A user function. Messages name the function by its kind, e.g. 'Loss', and its import path 'module:function'."""
 

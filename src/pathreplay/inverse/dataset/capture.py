@@ -70,6 +70,7 @@ def read_capture(
         photos = photos_of_json(base / capture.source, size_of)
         if masks is not None:
             photos = [replace(photo, mask=_mask(photo, masks)) for photo in photos]
+            _require_own_masks(photos)
     shots = {}
     for name, photo in zip(view_names([photo.name for photo in photos]), photos, strict=True):
         camera = _camera(photo, size_of(photo.image), capture, pixel_format)
@@ -87,12 +88,30 @@ def fingerprint(shots: Iterable[Shot]) -> str:
 
 
 def _mask(photo: Photo, masks: Path) -> Path:
-    """Find the mask of a photo: the photo's file name with '.png' appended, or with '.png' in place of its suffix."""
+    """Find the mask of a photo: the photo's file name with '.png' appended, or with '.png' in place of its suffix.
+
+    For the photo images/left/1.png, the folders images/left, left and . of the masks are searched, in this order.
+    """
     image = photo.image.name
-    mask = next((p for n in (f"{image}.png", f"{photo.image.stem}.png") if not file_problem(p := masks / n)), None)
+    folders = [part for part in Path(photo.name).parent.parts if part not in ("/", "..")]
+    names = [f"{image}.png", f"{photo.image.stem}.png"]
+    places = [masks.joinpath(*folders[k:], name) for k in range(len(folders) + 1) for name in names]
+    mask = next((place for place in places if not file_problem(place)), None)
     if mask is None:
         raise PathreplayError(f"{photo.where}: capture.masks {masks} has no {image}.png; correct it, or add the file")
     return mask
+
+
+def _require_own_masks(photos: list[Photo]) -> None:
+    """Raise PathreplayError if two photos of different subfolders would share a mask."""
+    owners: dict[Path | None, Photo] = {}
+    for photo in photos:
+        other = owners.setdefault(photo.mask, photo)
+        if other.image != photo.image:
+            raise PathreplayError(
+                f"capture.masks: {photo.mask} would be the mask of both {other.name} and {photo.name}; put masks into "
+                "the subfolders of the photos"
+            )
 
 
 def view_names(files: list[str]) -> list[str]:

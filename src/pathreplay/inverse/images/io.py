@@ -176,7 +176,7 @@ def with_channels(image: Image, channels: int) -> Image | None:
         image, have = image[:, :, : have - 1], have - 1
     if have == channels:
         return image
-    if have == 1:
+    if have == 1 and channels not in (2, 4):
         return np.repeat(image, channels, axis=2)
     if have == 3 and channels == 1:
         return (image @ LUMINANCE)[:, :, None].astype(np.float32)
@@ -251,8 +251,16 @@ def exr_bytes(image: Image) -> bytes:
 
 
 def png_bytes(image: Image, exposure: float = 1.0) -> bytes:
-    """Encode an image times ``exposure`` as an 8-bit sRGB PNG file."""
-    shown = np.clip((image[:, :, :1] if image.shape[2] == 2 else image) * exposure, 0, 1).astype(np.float32)
+    """Encode the colours of an image times ``exposure`` as an 8-bit sRGB PNG file.
+
+    Of four channels, the last is alpha, by which the colours are premultiplied. PNG files store straight colours.
+    """
+    if image.shape[2] == 4:
+        straight = unpremultiplied(image)
+        shown = np.concatenate([straight[:, :, :3] * exposure, straight[:, :, 3:]], axis=2)
+    else:
+        shown = (image[:, :, :1] if image.shape[2] == 2 else image) * exposure
+    shown = np.clip(shown, 0, 1).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
     # Encode in memory, because only `run_folder` writes files; that module handles a full disk.
     stream = mi.MemoryStream()
@@ -267,13 +275,17 @@ def encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def displayed(image: Image, exposure: float) -> NDArray[np.floating]:
     """Multiply an image by ``exposure``, drop alpha, clip to [0, 1] and encode as sRGB, as a display shows it."""
-    colours = image[:, :, : 1 if image.shape[2] < 3 else 3].astype(np.float64)
-    return encoded(np.clip(colours * exposure, 0, 1))
+    return encoded(np.clip(_colours(image).astype(np.float64) * exposure, 0, 1))
+
+
+def _colours(image: Image) -> Image:
+    """Return the first channel of one or two channels, or the first three of more."""
+    return image[:, :, : 1 if image.shape[2] < 3 else 3]
 
 
 def exposure_for(image: Image) -> float:
     """Return the exposure at which 98 % of the pixels are below white (1 for a black image)."""
-    level = float(np.quantile(image[..., :3].max(axis=2), 0.98))
+    level = float(np.quantile(_colours(image).max(axis=2), 0.98))
     return 1.0 / level if level > 0 else 1.0
 
 

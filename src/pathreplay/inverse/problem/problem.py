@@ -286,7 +286,9 @@ def build_problem(
     derived = make_derived(params, derivations, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
-    targets, truth, messages = _seen(config, targets, used, _Opened(scene, params, keys, sensors), base, disk)
+    targets, truth, messages = _seen(
+        config, targets, used, _Opened(scene, params, keys, sensors, integrator), base, disk
+    )
     notes += messages
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target image of sensor '{missing.pop()}'; start a new run")
@@ -340,6 +342,7 @@ class _Opened:
     params: mi.SceneParameters
     keys: list[str]
     sensors: dict[str, int]
+    integrator: mi.Integrator
 
 
 def _seen(
@@ -361,7 +364,7 @@ def _seen(
         del other
         gc.collect()
     elif targets is None:
-        targets, notes = _pictures(config, shots, opened.scene, opened.sensors, base, disk)
+        targets, notes = _pictures(config, shots, opened, base, disk)
     if first and config.target.masks is not None:
         masks = by_view("masks", config.target.masks, opened.sensors, base)
         targets = masked(targets, read_masks(masks, opened.scene, opened.sensors, base))
@@ -405,10 +408,11 @@ def _response(config: Config) -> list[Variable]:
 
 
 def _pictures(
-    config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path, disk: DiskStore
+    config: Config, shots: Mapping[str, Shot], opened: _Opened, base: Path, disk: DiskStore
 ) -> tuple[Targets, tuple[str, ...]]:
     """Read the targets from the files of a capture or of the job. Returns targets, and notes for the user."""
-    how = Reading(config.target.alpha, hidden=bool((config.integrator.model_extra or {}).get("hide_emitters")))
+    scene, sensors = opened.scene, opened.sensors
+    how = Reading(config.target.alpha, hidden=bool(getattr(opened.integrator, "hide_emitters", False)))
     if config.capture is None:
         files = by_view("target images", config.target.images or [], sensors, base)
         return read_targets(files, how, scene, sensors, base, disk)
