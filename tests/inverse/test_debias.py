@@ -11,6 +11,7 @@ import pathreplay
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.losses.pixelwise import LOSSES
 from pathreplay.inverse.objective.frozen import ViewTarget, _extrapolated
+from pathreplay.jobs import make_config
 
 RED, LIGHT = "red.reflectance.value", "light.emitter.radiance.value"
 SMOOTH = ("log", "ssim", "scale-invariant")
@@ -91,6 +92,13 @@ def test_an_odd_number_of_samples_is_split(target: np.ndarray) -> None:
 def test_where_it_cannot_help_it_is_refused(loss: str, spp: int, message: str) -> None:
     with pytest.raises(PathreplayError, match=message):
         problem(loss, spp, np.zeros((24, 24, 3), np.float32), debias=True)
+
+
+def test_shards_of_a_fixed_number_of_samples_are_not_those_of_an_adaptive_one() -> None:
+    job = {"scene": "cornell-box", "parameters": [{"key": "red.reflectance.value"}], "loss": "log", "debias": True}
+    make_config({**job, "target": {"values": {"red.reflectance.value": 0.5}}, "spp": 64, "spp_shards": 8})
+    with pytest.raises(PathreplayError, match="set spp to 16 or more"):
+        make_config({**job, "target": {"values": {"red.reflectance.value": 0.5}}, "spp": 8, "spp_shards": 8})
 
 
 @pytest.mark.slow

@@ -102,6 +102,15 @@ def test_it_goes_on_bit_for_bit_steps_and_has_a_folder() -> None:
     np.testing.assert_array_equal(state.values[WALL], whole.values[WALL])
 
 
+def test_settings_of_a_run_reach_all_scenes() -> None:
+    """A bias that is removed from the loss of each scene changes the loss of both together."""
+    pair = Problem.joint([problem_in(0.5, loss="log", spp=4), problem_in(2.0, loss="log", spp=4)])
+    plain, debiased = (
+        pathreplay.minimize(pair, steps=1, progress=False, debias=debias).history[0].loss for debias in (False, True)
+    )
+    assert abs(debiased - plain) > 0.1 * abs(plain)
+
+
 def test_media_of_several_scenes_learn_each_for_itself() -> None:
     limits = {"type": "pathreplay", "max_depth": 4}
 

@@ -242,6 +242,35 @@ except PathreplayError as error:
     assert "0.5 to 1.5" in str(error)
 else:
     raise AssertionError("a reflectance above 1 was taken")
+
+# A colour that a bound has set to 0 or 1 has the gradient of its neighbours, and can leave the bound again.
+for key, form, evaluated, others in (
+    (key, form, lambda: dr.pi * bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1)), (0.001, 0.999)),
+    ("env.data", form_of(params, "env.data"), lambda: scene.environment().eval(around), (0.001, 1.0)),
+):
+    around = dr.zeros(mi.SurfaceInteraction3f, 1)
+    around.wi, around.wavelengths = mi.Vector3f(0, -0.6, 0.8), si.wavelengths
+    found = []
+    for number in (0.0, others[0], others[1], 1.0):
+        seen = dr.zeros(type(form.see(params[key])), dr.shape(form.see(params[key]))) + number
+        if not dr.is_tensor_v(seen):
+            seen = mi.Color3f(*[number] * 3)
+        dr.enable_grad(seen)
+        params[key] = form.store(seen)
+        params.update()
+        dr.backward(evaluated()[3])
+        found.append(np.abs(get_array(dr.grad(seen))).sum())
+    assert found[0] > 0.5 * found[1] > 0 and found[3] > 0.5 * found[2] > 0, (key, found)
+
+# A dictionary is loaded twice with the same result: Mitsuba converts its bitmaps in place.
+from pathreplay.scenes.loading import load_scene_for
+spec = {"type": "scene", "wall": {"type": "rectangle", "bsdf": {"type": "diffuse",
+    "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(np.tile(np.float32([0.6, 0.3, 0.1]), (2, 2, 1)))}}}}
+for _ in range(2):
+    texture = mi.traverse(load_scene_for(spec, [])[0])
+    name = next(name for name in texture.keys() if name.endswith("reflectance.data"))
+    texel = get_array(form_of(texture, name).see(texture[name]))[0, 0]
+    assert np.abs(texel - form.of_colours("", np.float32([[[0.6, 0.3, 0.1]]]))[0, 0]).max() < 0.02, texel
 print("fine")
 """
 

@@ -207,6 +207,29 @@ def test_a_folder_has_a_mask_for_each_picture(folder: Path) -> None:
         assert view.weight is not None and view.weight == pytest.approx(2 * top, abs=1e-5)
 
 
+def test_masks_are_found_in_the_subfolders_of_their_photos(folder: Path) -> None:
+    """Two photos of the same name do not share a mask."""
+    frames = [{"file_path": f"pictures/{side}/1.png", "transform_matrix": np.eye(4).tolist()} for side in "ab"]
+    (folder / "capture" / "twins.json").write_text(json.dumps({"camera_angle_x": 0.6, "frames": frames}))
+    masks = folder / "masks"
+    masks.mkdir()
+    for side in "ab":
+        (folder / "capture" / "pictures" / side).mkdir(parents=True)
+        picture = png_bytes(np.full((HEIGHT, WIDTH, 3), 0.5, np.float32))
+        (folder / "capture" / "pictures" / side / "1.png").write_bytes(picture)
+        (masks / side).mkdir()
+        (masks / side / "1.png").write_bytes(png_bytes(np.ones((HEIGHT, WIDTH, 1), np.float32)))
+    capture = Capture(transforms="capture/twins.json", masks="masks")
+    shots = read_capture(capture, folder, picture_size)
+    assert [shot.mask for shot in shots.values()] == [masks / side / "1.png" for side in "ab"]
+    (masks / "1.png").write_bytes((masks / "a" / "1.png").read_bytes())
+    for side in "ab":
+        (masks / side / "1.png").unlink()
+    with pytest.raises(PathreplayError, match="would be the mask of both") as told:
+        read_capture(capture, folder, picture_size)
+    assert "\n" not in str(told.value)
+
+
 def test_films_of_a_capture_have_alpha_to_be_compared(folder: Path) -> None:
     see_through = np.full((HEIGHT, WIDTH, 4), 0.25, np.float32)
     for k in range(4):

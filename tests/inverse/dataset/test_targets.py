@@ -13,8 +13,8 @@ import pytest
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.globbing import matching
-from pathreplay.inverse.images.io import encoded, exr_bytes, png_bytes
-from pathreplay.inverse.problem.problem import Problem, build_problem
+from pathreplay.inverse.images.io import encoded, exposure_for, exr_bytes, over_black, png_bytes, read_image
+from pathreplay.inverse.problem.problem import InMemory, Problem, build_problem
 from pathreplay.jobs import make_config
 
 WIDTH, HEIGHT = 6, 4
@@ -155,6 +155,11 @@ def test_alpha_is_composited_over_what_the_scene_has_behind(ending: str, folder:
         {"images": [f"picture.{ending}"], "alpha": "scene"}, integrator={"type": "pathreplay", "hide_emitters": True}
     )
     assert hidden.views[0].target == pytest.approx(np.array([0.8, 0.5, 0.1]) * alpha, abs=1e-4)
+    job = {"scene": "room.xml", "parameters": [{"key": "ball.bsdf.reflectance.value"}]}
+    target = {"images": [f"picture.{ending}"], "alpha": "scene"}
+    integrator = mi.load_dict({"type": "pathreplay", "hide_emitters": True})
+    given = build_problem(make_config({**job, "target": target}), Path(), memory=InMemory(integrator=integrator))
+    assert (given.views[0].target == hidden.views[0].target).all(), "an object has the options of a table"
 
 
 @pytest.mark.parametrize("ending", ["exr", "png"])
@@ -163,6 +168,27 @@ def test_alpha_is_compared_where_the_film_has_it(ending: str, folder: Path) -> N
     (folder / "room.xml").write_text(scene("rgba"))
     expected = np.concatenate([np.array([0.8, 0.5, 0.1]) * alpha, alpha], axis=2)
     assert target_of(f"picture.{ending}", alpha="compare") == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_png_has_straight_colours_and_its_exposure_spares_alpha(folder: Path) -> None:
+    premultiplied = np.full((HEIGHT, WIDTH, 4), [0.2, 0.1, 0.05, 0.5], np.float32)
+    (folder / "half.png").write_bytes(png_bytes(premultiplied, 2.0))
+    assert over_black(read_image(folder / "half.png"), folder / "half.png") == pytest.approx(
+        premultiplied * np.float32([2, 2, 2, 1]), abs=0.01
+    )
+
+
+def test_grey_is_not_alpha(folder: Path) -> None:
+    (folder / "grey.png").write_bytes(png_bytes(np.full((HEIGHT, WIDTH, 1), 0.2, np.float32)))
+    assert target_of("grey.png") == pytest.approx(np.full((HEIGHT, WIDTH, 3), 0.2), abs=0.01)
+    (folder / "room.xml").write_text(scene("rgba"))
+    with pytest.raises(PathreplayError, match="has 1 channel.*renders 4"):
+        target_of("grey.png")
+
+
+def test_alpha_does_not_set_the_exposure() -> None:
+    grey = np.full((HEIGHT, WIDTH, 1), 0.01, np.float32)
+    assert exposure_for(np.concatenate([grey, np.ones_like(grey)], axis=2)) == exposure_for(grey) == pytest.approx(100)
 
 
 def test_what_alpha_cannot_be_is_refused_in_one_line(folder: Path) -> None:
