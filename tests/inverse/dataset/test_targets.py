@@ -182,7 +182,7 @@ def test_grey_is_not_alpha(folder: Path) -> None:
     (folder / "grey.png").write_bytes(png_bytes(np.full((HEIGHT, WIDTH, 1), 0.2, np.float32)))
     assert target_of("grey.png") == pytest.approx(np.full((HEIGHT, WIDTH, 3), 0.2), abs=0.01)
     (folder / "room.xml").write_text(scene("rgba"))
-    with pytest.raises(PathreplayError, match="has 1 channel.*renders 4"):
+    with pytest.raises(PathreplayError, match=r"has 1 channel.*renders 4"):
         target_of("grey.png")
 
 
