@@ -285,10 +285,8 @@ def build_problem(
     unsolved, unsolved_poses = make_variables(scene, params, entries, base, modules, given.starts, bounded)
     derived = make_derived(params, derivations, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
-
-    targets, truth, messages = _seen(
-        config, targets, used, _Opened(scene, params, keys, sensors, integrator), base, disk
-    )
+    opened = _Opened(scene, params, keys, sensors, integrator)
+    targets, truth, messages = _seen(config, targets, used, opened, base, disk)
     notes += messages
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target image of sensor '{missing.pop()}'; start a new run")
