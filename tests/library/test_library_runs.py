@@ -123,6 +123,24 @@ def test_a_script_that_was_killed_is_started_again_and_ends_with_the_same_bits()
     assert checkpoint_bits(RUN) == checkpoint_bits(Path("whole"))
 
 
+@pytest.mark.parametrize("joint", [False, True], ids=["one scene", "two scenes"])
+def test_targets_that_were_rendered_again_do_not_end_a_run(joint: bool, photos: list[np.ndarray]) -> None:
+    """Threads sum in any order, so the targets of a second process differ in the last bits: the saved ones are used."""
+
+    def made(factor: float, **settings: Any) -> Problem:
+        seen = [photo * np.float32(factor) for photo in photos]
+        settings |= {"spp": 1, "eval_spp": 1, "deterministic": True}
+        problems = [Problem(room(), {WALL: GREY}, views(seen), **settings) for _ in range(1 + joint)]
+        return Problem.joint(problems) if joint else problems[0]
+
+    run(made(1), output="whole", steps=3)
+    run(made(1), output="run", steps=3, callbacks=[lambda it: it.number == 0])
+    with pytest.raises(PathreplayError, match="another target or weight of view"):
+        run(made(1.001), output="run", steps=3, resume=True)
+    run(made(1 + 1e-6), output="run", steps=3, resume=True)
+    assert checkpoint_bits(RUN) == checkpoint_bits(Path("whole"))
+
+
 def test_what_cannot_go_on_is_told_in_one_line(photos: list[np.ndarray]) -> None:
     problem = problem_of(photos)
     run(problem, output="run", steps=4)

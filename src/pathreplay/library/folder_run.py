@@ -100,16 +100,33 @@ class FolderRun:
         return result_of(outcome, self._stop.by)
 
 
-def require_targets(folder: Path, problem: Problem) -> None:
-    """Raise PathreplayError if targets or weights of a problem differ from those of the run in a folder."""
+def with_saved_targets(folder: Path, problem: Problem) -> Problem:
+    """Return a problem with the targets and weights of the run in a folder, so that the resumed run continues exactly.
+
+    Targets that were rendered again by several threads differ in the last bits, because the order of sums varies.
+
+    Raises:
+        PathreplayError: the targets or weights of the problem differ from those of the run by more than rounding.
+    """
     saved = saved_targets(folder)
     for view in problem.views:
         pairs = (saved.images.get(view.name), view.target), (saved.weights.get(view.name), view.weight)
-        if not all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs):
+        if not all(_same(*pair) for pair in pairs):
             raise PathreplayError(
                 f"Run {folder} has another target or weight of view '{view.name}' than the problem; use the original "
                 "targets, or start a new run"
             )
+    return problem.with_targets(saved)
+
+
+def _same(saved: Image | None, given: Image | None) -> bool:
+    """Return whether two images are equal up to rounding. None equals only None."""
+    if saved is None or given is None:
+        return saved is given
+    if saved.shape != given.shape:
+        return False
+    largest = float(np.abs(saved).max(initial=1))
+    return np.allclose(given, saved, rtol=1e-4, atol=1e-5 * largest)
 
 
 def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolder, dict[str, Image]]:

@@ -18,7 +18,7 @@ from pathreplay.inverse.loop.loop import ended
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.inverse.problem import problem as inner
 from pathreplay.inverse.problem.problem import put_values
-from pathreplay.library.folder_run import FolderRun, require_targets
+from pathreplay.library.folder_run import FolderRun, with_saved_targets
 from pathreplay.library.iterations import Iteration, iterations, run_of
 from pathreplay.library.optimizers import Stepper, adapted, options_of
 from pathreplay.library.problem import Problem, run_settings
@@ -151,13 +151,20 @@ def _minimized(
         stack.enter_context(bar)
         for note in problem.notes + built.notes:
             bar.remark(note)
+        in_python, resumed = problem.in_memory or own is not None, None
+        if resume and output is None:
+            raise PathreplayError("resume = True needs a folder; give 'output'")
+        if resume and output is not None and output.exists():
+            _, resumed = open_run_folder(output, in_python)
+            stack.callback(resumed.lock.close)
+            built = with_saved_targets(resumed.path, built)
         run = _run(problem, built, own, stack, bar)
         kept = None
         if output is not None:
-            job = Job(built.config, None, problem.base, in_python=problem.in_memory or own is not None)
-            kept = _folder_run(job, built, run, stop, output, resume, stack)
-        elif resume:
-            raise PathreplayError("resume = True needs a folder; give 'output'")
+            run.optimiser.state()  # raises PathreplayError if the state of the user's optimizer cannot be saved
+            job = Job(built.config, None, problem.base, in_python=in_python)
+            kept = FolderRun(job, built, run, stop, new_output(output, None), Path.cwd(), resumed)
+            stack.callback(kept.folder.lock.close)
         stack.enter_context(stopping(bar.say, "aborted" if kept is None else kept.remedy, stop))
         observers = [bar.observe, *_observers(bar, built, run, stop, kept)]
         # Changing the thread pool once is safer than once per step, see `jobs.optimize`. Callbacks, however, may read
@@ -185,21 +192,6 @@ def _run(problem: Problem, built: inner.Problem, own: object, stack: ExitStack, 
     if own is not None:
         run.optimiser = adapted(own, built, run.values)
     return run
-
-
-def _folder_run(
-    job: Job, built: inner.Problem, run: Run, stop: Stop, output: Path, resume: bool, stack: ExitStack
-) -> FolderRun:
-    """Create or resume the run folder."""
-    run.optimiser.state()  # raises PathreplayError if the state of the user's optimizer cannot be saved
-    resumed = None
-    if resume and output.exists():
-        _, resumed = open_run_folder(output, job.in_python)
-        stack.callback(resumed.lock.close)
-        require_targets(resumed.path, built)
-    kept = FolderRun(job, built, run, stop, new_output(output, None), Path.cwd(), resumed)
-    stack.callback(kept.folder.lock.close)
-    return kept
 
 
 def _observers(

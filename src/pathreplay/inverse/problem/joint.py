@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.schema import Config
+from pathreplay.inverse.dataset.targets import Targets
 from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.response import RESPONSE
@@ -28,6 +29,16 @@ class JointProblem(Problem):
         """See `Problem`."""
         part, place = self.place(view.sensor)
         return self.parts[part], self.parts[part].views[place]
+
+    def with_targets(self, targets: Targets) -> JointProblem:
+        """See `Problem`."""
+        joint = super().with_targets(targets)
+        seen, parts = iter(joint.views), []
+        for part in self.parts:
+            known = [(view, next(seen)) for view in part.views]
+            views = tuple(replace(view, target=other.target, weight=other.weight) for view, other in known)
+            parts.append(replace(part, views=views))
+        return replace(self, views=joint.views, parts=tuple(parts))
 
     def place(self, view: int) -> tuple[int, int]:
         """Return the index of the scene of a view, and the index of the view in this scene."""

@@ -147,6 +147,13 @@ class Problem:
         """Return the single-scene problem that renders a view, and the corresponding view of that problem."""
         return self, view
 
+    def with_targets(self, targets: Targets) -> Problem:
+        """Return this problem with other target images, one for each view, and other pixel weights."""
+        images = {name: self.disk.keep(image) for name, image in targets.images.items()}
+        weights = {name: self.disk.keep(weight) for name, weight in targets.weights.items()}
+        views = (replace(view, target=images[view.name], weight=weights.get(view.name)) for view in self.views)
+        return replace(self, views=tuple(views))
+
     def made(self) -> tuple[Pose | Derived, ...]:
         """Return the scene parameters that are computed from variables: poses and derived parameters."""
         return *self.poses, *self.derived
