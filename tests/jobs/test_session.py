@@ -102,6 +102,30 @@ def test_nothing_is_done_before_the_first_state() -> None:
         iterate(Path("jab.toml")) if Path("job.toml").write_text("") == 0 else None
 
 
+TOML = """scene = "room.xml"
+iterations = {iterations}
+spp = 1
+eval_spp = 1
+output = "run"
+parameters = [{{key = "wall.bsdf.reflectance.value", initial = 0.5}}]
+target = {{values = {{"wall.bsdf.reflectance.value" = 0.2}}, spp = 1}}
+"""
+
+
+@pytest.mark.parametrize("change", ["edited", "moved"])
+def test_the_folder_has_the_job_that_was_read(change: str) -> None:
+    file, text = Path("job.toml"), TOML.format(iterations=2).replace("\n", "\r\n").encode()
+    file.write_bytes(text)
+    with iterate("job.toml") as session:
+        if change == "edited":
+            file.write_text(TOML.format(iterations=3))
+        else:
+            file.rename("other.toml")
+        next(session)
+    assert Path("run/config.toml").read_bytes() == text
+    assert optimize(resume="run", progress=False).iterations == 2
+
+
 def test_a_view_that_is_not_there_is_told() -> None:
     with iterate(job()) as session:
         with pytest.raises(PathreplayError, match="No view 'left'; there are view-0"):

@@ -10,7 +10,7 @@ from typing import get_args
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.executor_options import ExecutorName
-from pathreplay.inverse.config.schema import Config, load_config
+from pathreplay.inverse.config.schema import Config, read_config
 from pathreplay.jobs.session import Optimization
 from pathreplay.platform.threads import one_thread
 from pathreplay.report.result import RunResult
@@ -107,5 +107,7 @@ def _started(
             raise PathreplayError("define changes a config file; for a Config, pass the values to make_config instead")
         job = Job(config, None, Path.cwd())
     else:
-        job = Job(load_config(Path(config), changes), Path(config), Path(config).parent.absolute(), changes)
+        path = Path(config)
+        checked, content = read_config(path, changes)
+        job = Job(checked, path, path.parent.absolute(), changes, content=content)
     return job, new_output(job.config.output if output is None else output, job.source), None

@@ -51,6 +51,8 @@ class Job:
     changes: tuple[str, ...] = ()
     in_python: bool = False
     """Whether parts of the job are Python objects, which the config cannot describe."""
+    content: bytes | None = None
+    """Content of the file ``source`` when the config was read, for a new run folder."""
 
 
 def resume_command(folder: Path, in_python: bool = False) -> str:
@@ -196,17 +198,17 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
 
     Args:
         output: path of the folder. If the path exists, the first free path of ``output-2``, ``output-3``, … is used.
-        job: the job. Its config file is copied unchanged as ``config.toml`` or ``config.yaml``. A config that comes
-            from Python or JSON, or was changed on the command line, is written as ``config.json``.
+        job: the job. The content of its config file is written unchanged as ``config.toml`` or ``config.yaml``. A
+            config that comes from Python or JSON, or was changed on the command line, is written as ``config.json``.
         files: content of further files by name.
         home: folder to which a relative ``output`` refers; default: the current folder.
 
     Raises:
         PathreplayError: the folder cannot be created or written.
     """
-    if job.source is not None and job.source.suffix != ".json" and not job.changes:
+    if job.source is not None and job.content is not None and job.source.suffix != ".json" and not job.changes:
         name = "config.yaml" if job.source.suffix.lower() in YAML else "config.toml"
-        copy: dict[str, Content] = {name: (job.base / job.source.name).read_bytes()}
+        copy: dict[str, Content] = {name: job.content}
     else:
         copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
     origin: Json = {

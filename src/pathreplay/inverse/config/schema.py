@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import io
 from collections.abc import Sequence
 from math import prod
 from pathlib import Path
@@ -407,11 +408,22 @@ def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
         PathreplayError: the file cannot be read, a key is unknown (the message suggests the nearest one), or a value is
             invalid.
     """
-    return _checked(str(path), read_table(path, changes))
+    return read_config(path, changes)[0]
+
+
+def read_config(path: Path, changes: Sequence[str] = ()) -> tuple[Config, bytes]:
+    """Read a job as `load_config` does. Returns the job and the content of its file, without the changes."""
+    content = _content(path)
+    return _checked(str(path), _table(path, content, changes)), content
 
 
 def read_table(path: Path, changes: Sequence[str] = ()) -> Any:
     """Read a job as `load_config` does, without checking it. Raises PathreplayError if the file cannot be read."""
+    return _table(path, _content(path), changes)
+
+
+def _content(path: Path) -> bytes:
+    """Return the content of the file of a job. Raises PathreplayError if the file cannot be read."""
     problem = file_problem(path, most_bytes(path))
     if problem == MISSING:
         siblings = path.parent.glob("*") if path.parent.is_dir() else []
@@ -422,8 +434,16 @@ def read_table(path: Path, changes: Sequence[str] = ()) -> Any:
     if problem:
         raise PathreplayError(f"Config {path} {problem}; give the path of a TOML or YAML file")
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        return path.read_bytes()
+    except OSError as error:
+        raise PathreplayError(f"Config {path} cannot be read ({error}); give a UTF-8 text file") from None
+
+
+def _table(path: Path, content: bytes, changes: Sequence[str]) -> object:
+    """Parse the content of the file of a job. Raises PathreplayError if the content is not valid."""
+    try:
+        text = io.StringIO(content.decode("utf-8"), newline=None).read()
+    except UnicodeDecodeError as error:
         raise PathreplayError(f"Config {path} cannot be read ({error}); give a UTF-8 text file") from None
     return defined(parsed(path, text), changes)
 
