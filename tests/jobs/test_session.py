@@ -126,6 +126,16 @@ def test_the_folder_has_the_job_that_was_read(change: str) -> None:
     assert optimize(resume="run", progress=False).iterations == 2
 
 
+def test_a_run_that_never_began_lets_go_of_its_folder() -> None:
+    with iterate(job()) as session:
+        next(session)
+    session = iterate(resume="run")
+    with pytest.raises(PathreplayError, match="is in use"):
+        iterate(resume="run")
+    del session
+    assert optimize(resume="run", progress=False).iterations == 4
+
+
 def test_a_view_that_is_not_there_is_told() -> None:
     with iterate(job()) as session:
         with pytest.raises(PathreplayError, match="No view 'left'; there are view-0"):

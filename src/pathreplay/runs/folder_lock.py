@@ -7,6 +7,7 @@ import os
 import re
 import socket
 import stat
+import weakref
 from pathlib import Path
 
 from pathreplay.errors import PathreplayError
@@ -20,7 +21,7 @@ LOCK = "lock"
 
 
 class FolderLock:
-    """Locks a file in ``folder`` from construction to `close`.
+    """Locks a file in ``folder`` from construction to `close`, or until the object is deleted.
 
     The lock is an advisory lock on the file (flock). The system releases the lock when the process ends for any reason.
     The file remains after the lock is released, and does not block other processes. If the file system or the operating
@@ -33,11 +34,13 @@ class FolderLock:
         path = folder / LOCK
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         try:
-            self.file = os.open(path, flags, 0o644)
+            self._file = os.open(path, flags, 0o644)
         except OSError as error:
             raise PathreplayError(
                 f"Lock file {path} cannot be opened ({error.strerror}); make the folder writable, or remove the file"
             ) from None
+        self._closing = weakref.finalize(self, os.close, self._file)
+        self._closing.atexit = False  # a run can still write its checkpoint when the interpreter ends
         try:
             self._take(folder, path)
         except BaseException:
@@ -45,15 +48,15 @@ class FolderLock:
             raise
 
     def _take(self, folder: Path, path: Path) -> None:
-        about = os.fstat(self.file)
+        about = os.fstat(self._file)
         if not stat.S_ISREG(about.st_mode) or about.st_nlink != 1:
             raise PathreplayError(f"Lock file {path} is not a regular file with a single link; remove it")
         if fcntl is None:
             return
         try:
-            fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            match = re.fullmatch(r"(\d+) ([\w.-]+)\s*", os.pread(self.file, 200, 0).decode("ascii", "replace"))
+            match = re.fullmatch(r"(\d+) ([\w.-]+)\s*", os.pread(self._file, 200, 0).decode("ascii", "replace"))
             holder = f"process {match[1]} on {match[2]}" if match else "another process"
             raise PathreplayError(
                 f"Run folder {folder} is in use by {holder}; wait until it ends, or stop it with Ctrl-C or "
@@ -62,11 +65,9 @@ class FolderLock:
         except OSError:
             return  # the file system does not support locks
         with contextlib.suppress(OSError):  # the lock is valid even if the disk is full
-            os.ftruncate(self.file, 0)
-            os.pwrite(self.file, f"{os.getpid()} {socket.gethostname()}\n".encode(), 0)
+            os.ftruncate(self._file, 0)
+            os.pwrite(self._file, f"{os.getpid()} {socket.gethostname()}\n".encode(), 0)
 
     def close(self) -> None:
         """Release the lock; a second call does nothing."""
-        if self.file >= 0:
-            os.close(self.file)
-            self.file = -1
+        self._closing()
