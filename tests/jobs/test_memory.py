@@ -209,6 +209,18 @@ def test_a_budget_holds_within_its_block(monkeypatch: pytest.MonkeyPatch) -> Non
     assert not memory.is_crowded()
 
 
+def test_budgets_end_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "taken", lambda: 0)
+    first, second, third = memory.within(1000), memory.within(None), memory.within(2000)
+    left = []
+    for block in (first, second, third):
+        block.__enter__()
+    for block in (first, third, second):
+        left.append(memory.available())
+        block.__exit__(None, None, None)
+    assert left[:2] == [1000, 2000] and min(left[2], memory.available()) > 2000
+
+
 def test_a_run_beyond_its_budget_ends_with_a_line_and_a_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing half-written: what was done is there, and the run goes on from it with more memory."""
     sizes = iter([10**8] * 60)

@@ -115,6 +115,24 @@ def test_handlers_come_back_and_scheduler_signals_may_come_twice() -> None:
     assert before == {number: signal.getsignal(number) for number in interrupts.ENDING}
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (1, 2, 0), (2, 0, 1)])
+def test_blocks_with_handlers_end_in_any_order(order: tuple[int, ...]) -> None:
+    came: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: came.append(-1))
+    try:
+        blocks = [interrupts.handled(lambda number, frame, n=n: came.append(n)) for n in range(3)]
+        for block in blocks:
+            block.__enter__()
+        active = [-1, 0, 1, 2]
+        for n in order:
+            blocks[n].__exit__(None, None, None)
+            active.remove(n)
+            signal.raise_signal(signal.SIGTERM)
+            assert came[-1] == active[-1]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def test_what_is_ignored_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:

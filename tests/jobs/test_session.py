@@ -13,6 +13,8 @@ import pytest
 import pathreplay
 from pathreplay.errors import PathreplayError
 from pathreplay.jobs import RunResult, iterate, make_config, optimize
+from pathreplay.platform import memory
+from pathreplay.platform.interrupts import ENDING
 from room_job import CLOUD
 from small_job import checkpoint_bits
 from wall_job import JOB, SCENE
@@ -134,6 +136,17 @@ def test_a_run_that_never_began_lets_go_of_its_folder() -> None:
         iterate(resume="run")
     del session
     assert optimize(resume="run", progress=False).iterations == 4
+
+
+def test_two_loops_that_alternate_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    handlers = {number: signal.getsignal(number) for number in ENDING}
+    with iterate(job(memory_limit="100 GB", iterations=2)) as first, iterate(job(iterations=3)) as second:
+        for one, other in zip(first, second, strict=False):
+            assert one.number == other.number
+        assert first.result is not None and next(second).number == 2
+    assert handlers == {number: signal.getsignal(number) for number in ENDING}
+    monkeypatch.setattr(memory, "taken", lambda: 10**15)
+    memory.require_kept()
 
 
 def test_a_view_that_is_not_there_is_told() -> None:

@@ -46,6 +46,26 @@ def name_of(number: int) -> str:
     return "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
 
 
+@dataclass(eq=False)
+class _Block:
+    """An active block of `handled`: its handler, and the handlers to restore at its end, by signal number."""
+
+    handle: Callable[[int, FrameType | None], object]
+    before: dict[int, Callable[[int, FrameType | None], object] | int]
+
+    def restore(self) -> None:
+        """Restore the handlers. A later block that is still active restores them in place of the handler of this."""
+        for number, handler in self.before.items():
+            later = next((block for block in _blocks if block.before.get(number) is self.handle), None)
+            if later is None:
+                signal.signal(number, handler)
+            else:
+                later.before[number] = handler
+
+
+_blocks: list[_Block] = []  # the active blocks; blocks of generators can end in any order
+
+
 @contextmanager
 def handled(
     handle: Callable[[int, FrameType | None], object], keep: Callable[[], bool] = lambda: False
@@ -53,21 +73,24 @@ def handled(
     """Call ``handle`` for each signal in `ENDING` within this block. Outside of the main thread, do nothing.
 
     If the parent process ignores SIGTERM or SIGHUP (nohup), this process also ignores the signal. The previous handlers
-    are restored at the end of the block, unless ``keep`` returns True because the process is about to exit.
+    are restored at the end of the block, unless ``keep`` returns True because the process is about to exit. Several
+    blocks can end in any order; signals call the handler of the block that was entered last.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can set handlers
         return
-    before = {number: signal.getsignal(number) for number in ENDING}
-    ours = [n for n, old in before.items() if old is not None and (n == signal.SIGINT or old != signal.SIG_IGN)]
+    known = {number: signal.getsignal(number) for number in ENDING}
+    before = {n: old for n, old in known.items() if old is not None and (n == signal.SIGINT or old != signal.SIG_IGN)}
+    block = _Block(handle, before)
+    _blocks.append(block)
     try:
-        for number in ours:
+        for number in before:
             signal.signal(number, handle)
         yield
     finally:
+        _blocks.remove(block)
         if not keep():
-            for number in ours:
-                signal.signal(number, before[number])
+            block.restore()
 
 
 @contextmanager

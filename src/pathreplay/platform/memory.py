@@ -35,28 +35,29 @@ def available() -> int:
             left = min(left, int(limit.read_text()) - int(used.read_text()) + sum(map(int, cached.values())))
         except (OSError, ValueError):  # the file does not exist, or contains 'max' (no limit)
             continue
-    if _budget is not None:
-        left = min(left, _budget - taken())
+    if _budgets:
+        left = min(left, min(_budgets) - taken())
     return max(left, 0)
 
 
-_budget: int | None = None
-"""Bytes that this process may use, if a budget is set."""
+_budgets: list[int] = []
+"""Budgets of the active blocks of `within`, in bytes."""
 
 
 @contextmanager
 def within(budget: int | None) -> Iterator[None]:
     """Set the memory budget of this process, in bytes, within this block. None sets no budget.
 
-    `available` respects the budget, and `require_kept` enforces it.
+    `available` respects the budget, and `require_kept` enforces it. Several blocks can be active and end in any order.
+    The smallest of their budgets applies.
     """
-    global _budget
-    before = _budget
-    _budget = budget
+    given = [] if budget is None else [budget]
+    _budgets.extend(given)
     try:
         yield
     finally:
-        _budget = before
+        for each in given:
+            _budgets.remove(each)
 
 
 def taken() -> int:
@@ -70,14 +71,14 @@ def taken() -> int:
 
 def is_crowded() -> bool:
     """Return whether this process uses more than half of its budget, so that caches should be dropped."""
-    return _budget is not None and taken() > _budget // 2
+    return bool(_budgets) and taken() > min(_budgets) // 2
 
 
 def require_kept() -> None:
     """Raise PathreplayError if the process has exceeded its budget."""
-    if _budget is not None and (now := taken()) > _budget:
+    if _budgets and (now := taken()) > (budget := min(_budgets)):
         raise PathreplayError(
-            f"The run uses {_readable(now)} of memory, and its 'memory_limit' is {_readable(_budget)}; use smaller "
+            f"The run uses {_readable(now)} of memory, and its 'memory_limit' is {_readable(budget)}; use smaller "
             "films or parameters, or raise the limit"
         )
 
