@@ -7,12 +7,14 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import PIL.Image
 import pytest
 import safetensors.numpy
+from typer.testing import CliRunner
 
 from page_samples import HOSTILE
 from pathreplay.cli import app
@@ -182,7 +184,7 @@ def test_films_that_cannot_be_made_are_told(tmp_path: Path, monkeypatch: pytest.
 def test_events_are_what_tensorboard_reads(tmp_path: Path) -> None:
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     (run,) = pasts([a_run(tmp_path / "a")])
-    assert tensorboard.write_events(run, tmp_path / "events") == 3
+    assert tensorboard.write_events(run, tmp_path / "events/a") == 3
     read = accumulator.EventAccumulator(str(tmp_path / "events/a"))
     read.Reload()
     assert set(read.Tags()["tensors"]) == {"loss", "penalty", f"error/{TEXTURE}", f"gradient_norm/{TEXTURE}"}
@@ -191,11 +193,33 @@ def test_events_are_what_tensorboard_reads(tmp_path: Path) -> None:
     assert [event.step for event in events] == [0, 1, 2]
     assert events[1].wall_time - events[0].wall_time == pytest.approx(0.5, abs=1e-3)
     with pytest.raises(PathreplayError, match="exists; remove it"):
-        tensorboard.write_events(run, tmp_path / "events")
+        tensorboard.write_events(run, tmp_path / "events/a")
+
+
+def test_events_of_runs_of_one_name_have_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Writer:
+        def __init__(self, folder: str) -> None:
+            Path(folder).mkdir(parents=True)
+
+        def add_scalar(self, tag: str, value: float, step: int, wall_time: float) -> None:
+            pass
+
+        def close(self) -> None:
+            pass
+
+    module = ModuleType("tensorboard.summary")
+    module.Writer = Writer
+    monkeypatch.setitem(sys.modules, "tensorboard", ModuleType("tensorboard"))
+    monkeypatch.setitem(sys.modules, "tensorboard.summary", module)
+    monkeypatch.chdir(tmp_path)
+    runs = [str(a_run(Path(one))) for one in ("x/run", "y/run", "z")]
+    told = CliRunner().invoke(app, ["tensorboard", *runs, "--output", "events"])
+    assert told.exit_code == 0, told.output
+    assert sorted(path.name for path in Path("events").iterdir()) == ["x_run", "y_run", "z"]
 
 
 def test_without_tensorboard_there_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tensorboard.summary", None)
     (run,) = pasts([a_run(tmp_path / "a")])
     with pytest.raises(PathreplayError, match="pip install 'pathreplay\\[tensorboard\\]'"):
-        tensorboard.write_events(run, tmp_path / "events")
+        tensorboard.write_events(run, tmp_path / "events/a")

@@ -71,9 +71,12 @@ def tensorboard(
 ) -> None:
     """Write loss, errors and gradient norms of runs as event files; view them with: tensorboard --logdir FOLDER."""
     with interrupts.undisturbed():
+        from pathreplay.platform.files import file_names
         from pathreplay.report.watch.past import pasts
         from pathreplay.report.watch.tensorboard import write_events
 
-    for run in pasts(runs):
-        typer.echo(f"{run.name}: {write_events(run, output)} iterations")
+    found = pasts(runs)
+    folders = file_names(run.name for run in found)
+    for run in found:
+        typer.echo(f"{run.name}: {write_events(run, output / folders[run.name])} iterations")
     typer.echo(f"view them with: tensorboard --logdir {output}")

@@ -9,8 +9,8 @@ from pathreplay.errors import PathreplayError
 from pathreplay.report.watch.past import Past
 
 
-def write_events(run: Past, output: Path) -> int:
-    """Write event files into a subfolder of ``output`` with the name of the run; return the number of iterations.
+def write_events(run: Past, folder: Path) -> int:
+    """Write event files into a new folder; return the number of iterations.
 
     Raises PathreplayError if the package tensorboard is missing, or the folder exists or cannot be written.
     """
@@ -21,7 +21,6 @@ def write_events(run: Past, output: Path) -> int:
             "TensorBoard is not installed; pip install 'pathreplay[tensorboard]', or tensorboard alone"
         ) from None
     history = run.history
-    folder = output / Path(run.name).name
     if folder.exists():
         raise PathreplayError(f"{folder} exists; remove it, or give another --output")
     began = (run.folder / "run.json").stat().st_mtime
