@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import errno
+import html
 import json
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -20,6 +23,7 @@ from pathreplay.jobs import optimize
 from pathreplay.platform.atomic_files import Content, chunks
 from pathreplay.runs import run_folder as folders
 from room_job import TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
+from small_job import checkpoint_bits
 
 
 @pytest.mark.parametrize("integrator", [pytest.param("prb", marks=pytest.mark.slow), "pathreplay"])
@@ -45,11 +49,11 @@ def test_run_folder_is_complete_and_the_report_self_contained() -> None:
     } <= names  # fmt: skip
     assert not [name for name in names if name.endswith(folders.PART)]
 
-    html = result.report.read_text()
-    links = re.findall(r'(?:src|href)="([^"]{0,40})', html)
+    page = result.report.read_text()
+    links = re.findall(r'(?:src|href)="([^"]{0,40})', page)
     assert len(links) >= 2 * 4 + 3 + 1  # views, texture, loss curve
     assert all(link.startswith("data:") for link in links)
-    assert "http://" not in html and "https://" not in html and not re.search(r"url\((?!#)", html)
+    assert "http://" not in page and "https://" not in page and not re.search(r"url\((?!#)", page)
 
     saved = safetensors.numpy.load_file(result.folder / "parameters.safetensors")
     assert saved[TEXTURE] == pytest.approx(result.parameters[TEXTURE])
@@ -58,6 +62,18 @@ def test_run_folder_is_complete_and_the_report_self_contained() -> None:
     lines = [json.loads(line) for line in (result.folder / "history.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in lines] == list(range(6))
     assert all(line["gradient_norms"][TEXTURE] > 0 for line in lines)
+
+
+def test_the_command_of_a_report_repeats_a_job_from_python(room: Path) -> None:
+    """The paths of the job refer to the folder in which Python ran, and not to the run folder."""
+    first = run(iterations=1, output="run", deterministic=True, target={"scene": "room.xml", "spp": 4})
+    found = re.search("<pre>(.*?)</pre>", first.report.read_text())
+    assert found is not None
+    (room / "elsewhere").mkdir()
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    environment = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"} | {"PATH": path}
+    subprocess.run(html.unescape(found[1]), shell=True, cwd=room / "elsewhere", env=environment, check=True)
+    assert checkpoint_bits(room / "run-2") == checkpoint_bits(room / "run")
 
 
 def test_bounds_hold_after_every_step() -> None:

@@ -63,7 +63,7 @@ def test_a_file_gives_the_bits_of_its_job(kind: str, place: Path) -> None:
         for key, value in job.parameters.items():
             np.testing.assert_array_equal(result.values[key], value)
     assert checkpoint_bits(Path("run")) == checkpoint_bits(Path("job"))
-    assert "pathreplay optimize" in Path("run/report.html").read_text()
+    assert "optimize(load_config(" in Path("run/report.html").read_text()
 
 
 def test_python_and_the_command_line_go_on_with_each_others_runs(place: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -254,6 +255,8 @@ class Outcome:
     """Decoded values of the variables, and the transforms or vertices of poses, by key."""
     notes: tuple[str, ...]
     verdict: Verdict
+    base: Path
+    """Folder to which relative paths in the config refer."""
     in_python: bool = False
     """Whether the job has Python objects; see `Job`."""
 
@@ -276,9 +279,13 @@ class Outcome:
             return resume_command(self.folder, self.in_python)
         if self.in_python:
             return f"pathreplay.minimize(problem, output={str(self.folder)!r})"
-        job = self.folder / "config.json" if self.source is None else self.source
+        if self.source is None:
+            # Read by `pathreplay optimize`, the copy of the config would refer to files in the run folder.
+            path = json.dumps(str(self.folder.absolute() / "config.json"), ensure_ascii=False)
+            call = f"from pathreplay.jobs import load_config, optimize; optimize(load_config({path}))"
+            return f"cd {shlex.quote(str(self.base))} && python -c {shlex.quote(call)}"
         changes = "".join(f" --set {shlex.quote(change)}" for change in self.changes)
-        return f"pathreplay optimize {shlex.quote(str(job))}{changes if self.source else ''}"
+        return f"pathreplay optimize {shlex.quote(str(self.source))}{changes}"
 
     def names(self) -> tuple[str, str]:
         """Return names for the job and its baseline: the types of their integrators.

@@ -115,7 +115,7 @@ def outcome_of(
     values = with_scene(problem, run.values)
     return Outcome(
         job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes, verdict,
-        job.in_python,
+        job.base.resolve(), job.in_python,
     )  # fmt: skip
 
 

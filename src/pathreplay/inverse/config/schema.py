@@ -394,7 +394,7 @@ _TABLES: dict[str, type[BaseModel]] = {
 }
 
 
-def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
+def load_config(path: str | Path, changes: Sequence[str] = ()) -> Config:
     """Read a job from a TOML, YAML or JSON file.
 
     Args:
@@ -408,7 +408,7 @@ def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
         PathreplayError: the file cannot be read, a key is unknown (the message suggests the nearest one), or a value is
             invalid.
     """
-    return read_config(path, changes)[0]
+    return read_config(Path(path), changes)[0]
 
 
 def read_config(path: Path, changes: Sequence[str] = ()) -> tuple[Config, bytes]:
