@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from page_samples import HOSTILE, sample
-from pathreplay.report.page_parts import common_exposure
+from pathreplay.inverse.loop.checkpoint import Entry
+from pathreplay.report.page_parts import common_exposure, plots
 from pathreplay.report.pages.document import document
 from pathreplay.report.pages.page import MOST_POINTS, thinned
 
@@ -76,6 +77,12 @@ def test_long_curves_are_thinned_and_keep_their_ends(count: int) -> None:
     places = thinned(count)
     assert len(places) <= MOST_POINTS + 1 and places == sorted(set(places))
     assert count == 0 or (places[0], places[-1]) == (0, count - 1)
+
+
+def test_a_parameter_that_the_last_stage_freezes_keeps_its_curve() -> None:
+    history = [Entry(0, 1.0, 0.5, {"a": 1.0, "b": 2.0}), Entry(1, 0.5, 0.5, {"b": 1.0})]
+    curves = {plot.code: plot.series[0].y for plot in plots(history) if plot.title == "gradient norm of"}
+    assert curves == {"a": (1.0, None), "b": (2.0, 1.0)}
 
 
 def test_one_exposure_is_that_of_all_pixels_together() -> None:

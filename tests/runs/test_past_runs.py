@@ -79,6 +79,15 @@ def test_a_page_has_curves_of_both_and_pictures_that_can_be_wiped(tmp_path: Path
     assert document(page).count(b"data:image/png") == 2 * 3 + 2
 
 
+def test_a_comparison_shows_parameters_that_the_last_stage_freezes(tmp_path: Path) -> None:
+    runs = pasts([a_run(tmp_path / "a"), a_run(tmp_path / "b")])
+    for run in runs:
+        run.history[-1].gradient_norms.clear()
+    page = compare.page(runs)
+    assert [plot.code for plot in page.plots if plot.title == "gradient norm of"] == [TEXTURE]
+    assert [parameter.key for parameter in page.parameters] == [TEXTURE]
+
+
 def test_runs_of_one_name_are_told_apart(tmp_path: Path) -> None:
     folders = [a_run(tmp_path / one / "run") for one in ("x", "y")]
     assert [past.name for past in pasts(folders)] == [str(folder) for folder in folders]

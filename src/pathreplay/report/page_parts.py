@@ -82,10 +82,10 @@ def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
         drawn.append(plot("penalty", "", penalty=(entry.penalty for entry in entries)))
     if len({entry.spp for entry in entries}) > 1:
         drawn.append(plot("samples per pixel", "", spp=(entry.spp for entry in entries)))
-    if not history:
-        return tuple(drawn)
-    errors, norms = history[-1].errors, history[-1].gradient_norms
-    for key in dict.fromkeys([*norms, *errors]):  # a pose has different keys for its errors and for its gradients
+    # A stage can freeze parameters, so that the last entry lacks the norms of their gradients.
+    errors = dict.fromkeys(key for entry in history for key in entry.errors)
+    norms = dict.fromkeys(key for entry in history for key in entry.gradient_norms)
+    for key in norms | errors:  # a pose has different keys for its errors and for its gradients
         if key in errors:
             drawn.append(plot("error of", key, error=(entry.errors.get(key) for entry in entries)))
         if key in norms:

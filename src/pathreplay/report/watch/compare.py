@@ -85,8 +85,8 @@ def _last(run: Past) -> Mapping[str, float]:
     return run.history[-1].errors if run.history else {}
 
 
-def _keys(tables: Iterable[Mapping[str, object]]) -> list[str]:
-    """Return the distinct keys of all tables, in order of first occurrence."""
+def _keys(tables: Iterable[Iterable[str]]) -> list[str]:
+    """Return the distinct keys of all tables or lists, in order of first occurrence."""
     return list(dict.fromkeys(itertools.chain.from_iterable(tables)))
 
 
@@ -126,11 +126,12 @@ def _plots(runs: list[Past]) -> tuple[Plot, ...]:
         return Plot(title, tuple(series), code=code, along="second" if seconds else "iteration")
 
     plots = [plot("loss by iterations", "", _loss_of), plot("loss by seconds", "", _loss_of, seconds=True)]
-    lasts = [run.history[-1] for run in runs if run.history]
-    for key in _keys(entry.gradient_norms | entry.errors for entry in lasts):
-        if any(key in entry.errors for entry in lasts):
+    entries = [entry for run in runs for entry in run.history]
+    norms, errors = _keys(entry.gradient_norms for entry in entries), _keys(entry.errors for entry in entries)
+    for key in _keys([norms, errors]):
+        if key in errors:
             plots.append(plot("error of", key, lambda entry, key=key: entry.errors.get(key)))  # type: ignore[misc]
-        if any(key in entry.gradient_norms for entry in lasts):
+        if key in norms:
             norm = lambda entry, key=key: entry.gradient_norms.get(key)  # noqa: E731
             plots.append(plot("gradient norm of", key, norm))
     return tuple(plots)
@@ -158,13 +159,12 @@ def _views(runs: list[Past]) -> tuple[View, ...]:
 
 
 def _parameters(runs: list[Past]) -> tuple[Parameter, ...]:
-    keys = [key for run in runs if run.history for key in run.history[-1].gradient_norms]
+    names_of = [file_names(_keys(entry.gradient_norms for entry in run.history)) for run in runs]
     sections = []
-    for key in dict.fromkeys(keys):
+    for key in _keys(names_of):
         for what, columns in (("texture", 3), ("volume", 2)):
             pictures = []
-            for run in runs:
-                names = file_names(run.history[-1].gradient_norms if run.history else ())
+            for run, names in zip(runs, names_of, strict=True):
                 if key in names:
                     file = f"{what}-{{}}-{names[key]}"
                     pictures += [_picture(run, run.name, run.name, file.format("result"), MOST_PIXELS / 16)]
