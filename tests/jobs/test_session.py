@@ -128,6 +128,13 @@ def test_the_folder_has_the_job_that_was_read(change: str) -> None:
     assert optimize(resume="run", progress=False).iterations == 2
 
 
+def test_a_job_in_a_file_with_a_suffix_in_capitals_goes_on() -> None:
+    Path("job.JSON").write_text(job(iterations=2).model_dump_json(exclude_unset=True))
+    with iterate("job.JSON") as session:
+        next(session)
+    assert optimize(resume="run", progress=False).iterations == 2
+
+
 def test_a_run_that_never_began_lets_go_of_its_folder() -> None:
     with iterate(job()) as session:
         next(session)

@@ -206,7 +206,7 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
     Raises:
         PathreplayError: the folder cannot be created or written.
     """
-    if job.source is not None and job.content is not None and job.source.suffix != ".json" and not job.changes:
+    if job.source is not None and job.content is not None and job.source.suffix.lower() != ".json" and not job.changes:
         name = "config.yaml" if job.source.suffix.lower() in YAML else "config.toml"
         copy: dict[str, Content] = {name: job.content}
     else:
