@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import PIL.Image
 import pytest
 import scipy.optimize
 from safetensors.numpy import load_file
@@ -26,6 +27,7 @@ from pathreplay.scenes.loading import load_scene
 from places import ROOT
 from variant import VARIANT
 
+RED = "red.reflectance.value"
 README = ROOT / "README.md"
 PAGE = ROOT / "docs" / "library.md"
 
@@ -157,6 +159,42 @@ def test_arrays_tensors_bitmaps_and_files_are_targets(photos: list[np.ndarray], 
     for kind in kinds:
         problem = Problem(room(), {WALL: GREY}, View(0, kind))
         np.testing.assert_allclose(problem.built.views[0].target, photos[0], rtol=1e-6)
+
+
+def test_files_and_bitmaps_are_read_as_by_a_job(tmp_path: Path) -> None:
+    """Masks are stored values, of luminance if coloured. Targets are decoded and composited over black."""
+    mask, image = np.full((SIDE, SIDE), 255, np.uint8), np.full((SIDE, SIDE, 4), 128, np.uint8)
+    mask[:, :8], image[:, :8, 3] = 64, 0
+    PIL.Image.fromarray(mask).save("grey.png")
+    PIL.Image.fromarray(mask).convert("RGB").save("colour.png")
+    PIL.Image.fromarray(image).save("target.png")
+
+    def by_library(target: Any, weight: Any) -> tuple[np.ndarray, np.ndarray]:
+        view = Problem("cornell-box", RED, View(0, target, weight), scene_parameters={"resolution": SIDE}).built.views[
+            0
+        ]
+        return view.target, view.weight
+
+    def by_job(target: str, weight: str) -> tuple[np.ndarray, np.ndarray]:
+        job = {
+            "scene": "cornell-box",
+            "scene_parameters": {"resolution": SIDE},
+            "parameters": [{"key": RED}],
+            "target": {"images": [target], "masks": [weight]},
+        }
+        (tmp_path / "job.json").write_text(json.dumps(job))
+        view = pathreplay.load_job("job.json").built.views[0]
+        return view.target, view.weight
+
+    for name in ("grey.png", "colour.png"):
+        target, weight = by_job("target.png", name)
+        assert weight[0, 0] / weight[0, 8] == pytest.approx(64 / 255) and target[0, 0].max() == 0 < target[0, 8].min()
+        for found in (
+            by_library("target.png", name),
+            by_library(mi.Bitmap("target.png"), mi.Bitmap(name)),
+        ):
+            np.testing.assert_allclose(found[0], target, rtol=1e-6)
+            np.testing.assert_allclose(found[1], weight, rtol=1e-6)
 
 
 XML = """<scene version="3.0.0">
@@ -352,6 +390,9 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(views=[View(0, np.zeros((16, 16, 3))), View("left", np.zeros((16, 16, 3)))]), "is named twice"),
         (bad(views=View(0, np.full((16, 16, 3), np.nan))), "NaN"),
         (bad(views=View(0, np.zeros((16, 16, 3)), weight=np.zeros((16, 16)))), "is black"),
+        (bad(views=View(0, np.zeros((16, 16, 3)), weight=np.ones((3, 4)))), r"\(3, 4, 1\); give \(16, 16\)"),
+        (bad(target={"alpha": "mask"}), "'target' would be replaced by 'views'; use View\\(target"),
+        (bad(test_views=["left"]), "'test_views' would be replaced by 'views'; use View\\(test=True\\)"),
         (bad(loss="l3"), "No loss 'l3'"),
         (bad(loss=lambda a, b: "much"), "cannot be computed|returns the str"),
         (bad(integrator={"type": "path"}), "computes no gradients"),

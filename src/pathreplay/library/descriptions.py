@@ -88,7 +88,10 @@ class View:
     Args:
         sensor: index or id of the sensor.
         target: linear pixels (height, width, channels): a NumPy or Dr.Jit array, a `mi.Bitmap`, or an image file.
-        weight: nonnegative pixel weights (height, width), normalised to mean 1. Default: equal weights.
+            Bitmaps and files are decoded from sRGB if they have 8 or 16 bits, and composited over black.
+        weight: nonnegative pixel weights (height, width), normalised to mean 1: an array, a `mi.Bitmap` or an image
+            file. The stored values of bitmaps and files are used, without decoding; colours are converted to luminance.
+            Default: equal weights.
         share: weight of the view relative to the other views.
         test: whether the view is a test view.
     """

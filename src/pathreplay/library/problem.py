@@ -37,6 +37,14 @@ OF_A_PROBLEM = frozenset(
     "view_weights target loss learning_rate deterministic memory_limit".split()
 )
 """Keys of a job that are fixed when the problem is created."""
+OF_VIEWS = {
+    "target": "View(target=..., weight=...)",
+    "sensors": "View(sensor=...)",
+    "test_views": "View(test=True)",
+    "view_weights": "View(share=...)",
+    "capture": "load_job, without 'views'",
+}
+"""Keys of a job that views replace, and what takes their place."""
 
 
 class Problem:
@@ -82,6 +90,7 @@ class Problem:
         deterministic: bool = False,
         **settings: object,
     ) -> None:
+        _require_none_of_views(settings)
         settings |= {"spp": spp, "learning_rate": learning_rate, "seed": seed, "deterministic": deterministic}
         self._build(settings, Path.cwd(), scene, parameters, views, loss, integrator, derived or {})
 
@@ -256,6 +265,12 @@ def run_settings(name: str, steps: int | None, options: Json | None, settings: M
     return {key: value for key, value in given.items() if value is not None}
 
 
+def _require_none_of_views(settings: Mapping[str, object]) -> None:
+    """Raise PathreplayError if a setting beside 'views' would be replaced by them."""
+    if dropped := [key for key in OF_VIEWS if settings.get(key) is not None]:
+        raise PathreplayError(f"'{dropped[0]}' would be replaced by 'views'; use {OF_VIEWS[dropped[0]]} instead")
+
+
 def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
     """Convert a value to the ``wanted`` shape of its parameter. Textures and grids may have another resolution.
 
@@ -339,6 +354,8 @@ def load_job(
     Raises:
         PathreplayError: the file cannot be read, or the problem is invalid.
     """
+    if views is not None:
+        _require_none_of_views(settings)
     table = read_table(Path(path), define)
     make_config(table, str(path))  # checks the file alone, so that error messages name the file
     table = {key: value for key, value in {**table, **settings}.items() if value is not None}

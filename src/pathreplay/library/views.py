@@ -12,7 +12,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import picture_shape
 from pathreplay.inverse.dataset.targets import Targets, as_weight
 from pathreplay.inverse.dataset.views import sensors_of
-from pathreplay.inverse.images.io import Image, find_image, read_image
+from pathreplay.inverse.images.io import Image, find_image, over_black, read_image
 from pathreplay.inverse.parameters.values import adapted_image
 from pathreplay.library.descriptions import View
 
@@ -45,19 +45,25 @@ def targets_of(scene: mi.Scene, views: Mapping[str, View]) -> Targets:
             )
         images[name] = adapted_image(what, image, "the film has", channels)
         if view.weight is not None:
-            mask = _pixels(f"Weight of sensor '{name}'", view.weight)
-            if mask.shape != (height, width, 1):
-                raise PathreplayError(f"Weight of sensor '{name}' has the shape {mask.shape}; give ({height}, {width})")
-            weights[name] = as_weight("the weight", mask, name)
+            what = f"Weight of sensor '{name}'"
+            mask = _pixels(what, view.weight, stored=True)
+            if mask.shape[:2] != (height, width):
+                raise PathreplayError(f"{what} has the shape {mask.shape}; give ({height}, {width})")
+            weights[name] = as_weight("the weight", adapted_image(what, mask, "a weight has", 1), name)
     return Targets(images, weights)
 
 
-def _pixels(what: str, value: object) -> Image:
-    """Convert an image to linear pixels (height, width, channels). Raises PathreplayError if this is impossible."""
+def _pixels(what: str, value: object, *, stored: bool = False) -> Image:
+    """Convert an image to pixels (height, width, channels). Raises PathreplayError if this is impossible.
+
+    Pixels are linear, and their colours premultiplied by alpha. With ``stored``, the values of files and bitmaps are
+    kept as they are, like the values of masks in a job.
+    """
     if isinstance(value, (str, Path)):
-        return read_image(find_image(str(value), Path()))
+        path = find_image(str(value), Path())
+        return read_image(path, raw=True) if stored else over_black(read_image(path), path)
     if isinstance(value, mi.Bitmap):
-        value = value.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
+        value = _floats(value, stored)
     if value is None:
         raise PathreplayError(f"{what} is missing; give an array, a mi.Bitmap or a file")
     try:
@@ -68,3 +74,14 @@ def _pixels(what: str, value: object) -> Image:
     if image.ndim != 3:
         raise PathreplayError(f"{what} has the shape {image.shape}; give (height, width, channels)")
     return image
+
+
+def _floats(bitmap: mi.Bitmap, stored: bool) -> mi.Bitmap:
+    """Convert a bitmap to floats; for ``stored`` see `_pixels`. Bitmaps of PNG files have straight alpha."""
+    transform = mi.Bitmap.AlphaTransform.Empty
+    if stored:
+        bitmap = mi.Bitmap(bitmap)
+        bitmap.set_srgb_gamma(False)
+    elif bitmap.has_alpha() and not bitmap.premultiplied_alpha():
+        transform = mi.Bitmap.AlphaTransform.Premultiply
+    return bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False, alpha_transform=transform)
