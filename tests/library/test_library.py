@@ -262,6 +262,43 @@ def test_learning_rates_of_parameters_are_those_of_mitsubas_optimizer(key: str, 
         assert np.abs(result.values[each] - problem.initial[each]).max() == pytest.approx(rate, rel=1e-2)
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"final_learning_rate_ratio": 0.01, "learning_rate_schedule": "exponential", "steps": 4},
+        {"warmup_steps": 3, "steps": 4},
+        {"stages": [{"iterations": 2}, {"iterations": 2, "learning_rate_factor": 0.01}]},
+    ],
+    ids=["schedule", "warm-up", "stages"],
+)
+def test_schedules_and_stages_scale_the_rate_of_mitsubas_optimizer(
+    settings: dict[str, Any], photos: list[np.ndarray]
+) -> None:
+    problem = Problem(room(), {WALL: GREY}, views(photos), spp=4, deterministic=True, learning_rate=0.03)
+    ours = {"type": "adam", "beta_2": 0.999, "iterate_averaging": False}
+    results = [pathreplay.minimize(problem, of, progress=False, **settings) for of in (ours, mi.ad.Adam(lr=0.03))]
+    np.testing.assert_allclose(results[1].values[WALL], results[0].values[WALL], rtol=1e-4)
+
+
+def test_frozen_parameters_keep_their_state_in_mitsubas_optimizer(photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY, TEXTURE: GREY}, views(photos), spp=4, deterministic=True, learning_rate=0.03)
+    stages = [{"iterations": 2}, {"iterations": 8, "parameters": [TEXTURE]}, {"iterations": 1}]
+    ours = {"type": "adam", "beta_2": 0.999, "iterate_averaging": False}
+    results = [pathreplay.minimize(problem, of, stages=stages, progress=False) for of in (ours, mi.ad.Adam(lr=0.03))]
+    for key in (WALL, TEXTURE):
+        np.testing.assert_allclose(results[1].values[key], results[0].values[key], rtol=1e-4, atol=1e-5)
+
+
+def test_exposures_and_response_have_their_learning_rates_in_mitsubas_optimizer(photos: list[np.ndarray]) -> None:
+    """The first step of Adam has the length of the rate, in the logarithm of exposures and of the exponent."""
+    fitted = {"exposure": {"learning_rate": 0.001}, "response": {"kind": "gamma", "learning_rate": 0.002}}
+    problem = Problem(room(), {WALL: GREY}, views([photos[0], 2 * photos[1]]), spp=4, **fitted)
+    result = pathreplay.minimize(problem, mi.ad.Adam(lr=0.1), steps=1, progress=False)
+    for key, rate in (("exposure", 0.001), ("response", 0.002)):
+        moved = np.abs(np.log(result.values[key] / problem.initial[key]))
+        assert moved.max() == pytest.approx(rate, rel=2e-2), key
+
+
 def test_losses_of_ones_own_and_by_name(photos: list[np.ndarray]) -> None:
     def own(image: Any, target: Any) -> Any:
         return dr.abs(image - target)

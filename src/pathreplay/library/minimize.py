@@ -88,9 +88,9 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         problem: the problem. Afterwards its scene has the resulting values.
         optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"``, ``"l-bfgs-b"``,
             ``"levenberg-marquardt"``, or a mapping with ``type`` and options. An optimizer of `mitsuba.ad` must have no
-            variables yet. Its learning rate applies to parameters without a learning rate of their own. Any other
-            object needs a method ``step(values, gradients, learning_rates, loss) -> values``, with arrays by name. A
-            function needs the interface of `scipy.optimize.minimize`, such as
+            variables yet. Its learning rate applies to parameters without a learning rate of their own; schedule and
+            stages scale both. Any other object needs a method ``step(values, gradients, learning_rates, loss) ->
+            values``, with arrays by name. A function needs the interface of `scipy.optimize.minimize`, such as
             ``functools.partial(scipy.optimize.minimize, method="SLSQP")``. It supports parameters with up to 1000
             entries in total.
         steps: number of iterations. Default: ``iterations`` of the problem's job, or 200.

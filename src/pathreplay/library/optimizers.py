@@ -12,7 +12,9 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.loop.loop import optimiser_of
 from pathreplay.inverse.optim.adaptive import Optimiser, State
+from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.pose import PART_NAMES
+from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import latents
 from pathreplay.inverse.problem.problem import Problem
@@ -36,15 +38,20 @@ class Stepper(Protocol):
 class OfMitsuba:
     """An optimiser of `mitsuba.ad` or `drjit.opt`.
 
-    Variables in ``own`` use their learning rates in the problem. Other variables use the optimiser's learning rate.
+    Variables in ``own`` use their learning rates in the problem. Other variables use the optimiser's learning rate, to
+    which the schedule and the stages of the problem apply as well. ``problem_rates`` are the learning rates of all
+    variables in the problem, before schedule and stages.
     """
 
     finished = ""
 
-    def __init__(self, optimizer: Any, values: Arrays, own: Collection[str]) -> None:
+    def __init__(
+        self, optimizer: Any, values: Arrays, own: Collection[str], problem_rates: Mapping[str, float]
+    ) -> None:
         if any(True for _ in optimizer.keys()):
             raise PathreplayError("optimizer: it already has variables; give an optimizer without variables")
         self._optimizer, self._own, self._steps = optimizer, own, dict.fromkeys(values, 0)
+        self._problem_rates = problem_rates
         for key, value in values.items():
             optimizer[key] = mi.TensorXf(value)
 
@@ -53,15 +60,28 @@ class OfMitsuba:
     ) -> dict[str, Array]:
         """See `Optimiser`."""
         optimizer = self._optimizer
-        if rates := {key: rates[key] for key in values if key in self._own}:
-            optimizer.set_learning_rate(rates)
+        known = optimizer.state
         for key, value in values.items():
             anew = optimizer[key].shape != value.shape
             self._steps[key] = 1 if anew else self._steps[key] + 1
             optimizer[key] = mi.TensorXf(value)
             dr.set_grad(optimizer[key], mi.TensorXf(gradients[key]))
+        optimizer.state = {key: known[key] for key in values}  # other variables keep their state
+        before = {key: optimizer.learning_rate(key) for key in values}
+        optimizer.set_learning_rate({key: self._rate(key, rates[key]) for key in values})
         optimizer.step()
+        optimizer.set_learning_rate(before)
+        known |= optimizer.state
+        optimizer.state = known
         return {key: np.array(dr.detach(optimizer[key])).reshape(value.shape) for key, value in values.items()}
+
+    def _rate(self, key: str, rate: float) -> float | dr.ArrayBase:
+        """Return the learning rate of a variable, whose learning rate in the problem is now ``rate``."""
+        if key in self._own:
+            return rate
+        own_rate, common_rate = self._optimizer.learning_rate(key), self._optimizer.learning_rate()
+        found: float | dr.ArrayBase = common_rate if own_rate is None else own_rate
+        return found * (rate / self._problem_rates[key])
 
     def answer(self, values: Arrays) -> dict[str, Array]:
         """See `Optimiser`."""
@@ -160,16 +180,21 @@ def adapted(optimizer: Any, problem: Problem, values: Arrays) -> Optimiser:
     if not hasattr(optimizer, "step"):
         return optimiser_of(problem, values, problem.config.optimizer, optimizer)
     if hasattr(optimizer, "set_learning_rate") and hasattr(optimizer, "keys"):
-        return OfMitsuba(optimizer, latents(problem.variables, values), _rated(problem))
+        rates = {v.key: v.learning_rate for v in problem.variables}
+        return OfMitsuba(optimizer, latents(problem.variables, values), _rated(problem), rates)
     return OfUser(optimizer, values)
 
 
 def _rated(problem: Problem) -> set[str]:
-    """Return the variables whose parameters have their own learning rates."""
-    owners = {v.key: v.key.rpartition(":")[0] if v.key.endswith(PART_NAMES) else v.key for v in problem.variables}
-    entries = [e for e in problem.config.parameters if e.learning_rate or e.rotation_learning_rate]
+    """Return the variables whose parameters, exposures or response have their own learning rates."""
+    config = problem.config
+    fitted = {EXPOSURE: config.exposure, RESPONSE: config.response}
+    keys = [v.key for v in problem.variables if v.key not in fitted]
+    owners = {key: key.rpartition(":")[0] if key.endswith(PART_NAMES) else key for key in keys}
+    entries = [e for e in config.parameters if e.learning_rate or e.rotation_learning_rate]
     rated = resolve_keys(dict.fromkeys(owners.values()), [entry.key for entry in entries])
-    return {key for key, owner in owners.items() if owner in rated}
+    own = {key for key, owner in owners.items() if owner in rated}
+    return own | {key for key, options in fitted.items() if options is not None and options.learning_rate}
 
 
 def options_of(optimizer: object) -> tuple[Json | None, object]:
