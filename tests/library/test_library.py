@@ -18,7 +18,7 @@ import scipy.optimize
 from safetensors.numpy import load_file
 
 import pathreplay
-from library_scenes import BODY, GREY, SIDE, TEXTURE, WALL, Descent, photos_of_room, room, views
+from library_scenes import BODY, GREY, SIDE, TEXTURE, WALL, Descent, InPlace, photos_of_room, room, views
 from ordinary_scenes import SCENES, Write
 from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.inverse.images.io import exr_bytes
@@ -386,10 +386,11 @@ def test_what_one_minimisation_learns_of_media_is_not_known_to_others() -> None:
     assert found[0] == found[1] == found[2] and f(seed=5)[0] == before
 
 
-def test_an_iteration_that_is_kept_stays_as_it_was(photos: list[np.ndarray]) -> None:
+@pytest.mark.parametrize("make", [lambda: "adam", InPlace], ids=["name", "in place"])
+def test_an_iteration_that_is_kept_stays_as_it_was(make: Callable[[], Any], photos: list[np.ndarray]) -> None:
     kept: list[pathreplay.Iteration] = []
-    problem = Problem(room(), {WALL: GREY}, views(photos))
-    pathreplay.minimize(problem, steps=4, callbacks=[kept.append], progress=False)
+    problem = Problem(room(), {WALL: Parameter(initial=0.5)}, views(photos))
+    pathreplay.minimize(problem, make(), steps=4, callbacks=[kept.append], progress=False)
     assert len({float(it.values[WALL][0]) for it in kept}) == 4
 
 

@@ -88,11 +88,26 @@ class Heavy(Descent):
         self.velocity = dict(state)
 
 
+class InPlace(Heavy):
+    """An optimiser of the user's own that changes its values and what it remembers in place."""
+
+    def step(self, values: Any, gradients: Any, learning_rates: Any, loss: float) -> dict[str, np.ndarray]:
+        for key, gradient in gradients.items():
+            velocity = self.velocity.get(key)
+            if velocity is None or velocity.shape != gradient.shape:
+                velocity = self.velocity[key] = np.zeros_like(gradient)
+            velocity *= 0.5
+            velocity += gradient
+            values[key] -= 20 * learning_rates[key] * velocity
+        return values
+
+
 OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "adam": lambda: "adam",
     "mitsuba": lambda: mi.ad.Adam(lr=0.03),
     "sgd of mitsuba": lambda: mi.ad.SGD(lr=0.5, momentum=0.8),
     "own": Heavy,
+    "own, in place": InPlace,
 }
 SEARCHES: dict[str, Callable[[], Any]] = {
     "l-bfgs-b": lambda: "l-bfgs-b",

@@ -137,7 +137,9 @@ class OfUser:
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
     ) -> dict[str, Array]:
         """See `Optimiser`. Raises PathreplayError if a value is missing or has the wrong shape."""
-        found = self._stepper.step(values, gradients, rates, loss)
+        # The object may change its arguments in place. Values also belong to earlier iterations and states.
+        copies = {key: np.array(value) for key, value in values.items()}
+        found = self._stepper.step(copies, gradients, rates, loss)
         stepped = {}
         for key, value in values.items():
             if not isinstance(found, Mapping) or key not in found:
@@ -164,7 +166,9 @@ class OfUser:
     def restore(self, state: State, values: Arrays) -> None:
         """See `Optimiser`. Raises PathreplayError if the object has no ``load_state_dict``."""
         self._require_state()
-        self._stepper.load_state_dict({name.removeprefix("own:"): array for name, array in state.arrays.items()})
+        self._stepper.load_state_dict(
+            {name.removeprefix("own:"): np.array(array) for name, array in state.arrays.items()}
+        )
         self._steps = dict(state.steps)
 
     def _require_state(self) -> None:
