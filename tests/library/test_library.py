@@ -332,6 +332,32 @@ def test_a_pose_a_derived_parameter_and_arrays_as_starts(photos: list[np.ndarray
     np.testing.assert_allclose(np.array(mi.traverse(other)[BODY]), result.values[BODY].ravel(), atol=1e-6)
 
 
+def test_values_go_to_another_scene_or_it_is_told(photos: list[np.ndarray], tmp_path: Path) -> None:
+    """Which stores an index as a plain number, a texture as 8 bits, or one number in place of a colour."""
+    PIL.Image.fromarray(np.full((4, 4, 3), 100, np.uint8)).save("texture.png")
+    described, eta = room(), "body.bsdf.eta"
+    described["body"]["bsdf"] = {"type": "dielectric"}
+    floor = {"type": "bitmap", "filename": str(tmp_path / "texture.png")}
+    described["floor"]["bsdf"]["reflectance"] = floor
+    wanted = {eta: Parameter(initial=1.3), TEXTURE: Parameter(initial=0.25), WALL: Parameter(initial=0.25)}
+    problem = Problem(described, wanted, views(photos), spp=1)
+
+    other = mi.load_dict(described)
+    before = np.array(mi.traverse(other)[TEXTURE])
+    with pytest.raises(PathreplayError, match=f"'{TEXTURE}' cannot be given a value: .* 8-bit .*'variant'") as told:
+        problem.assign(problem.initial, other)
+    assert "\n" not in str(told.value)
+    np.testing.assert_array_equal(np.array(mi.traverse(other)[TEXTURE]), before)
+    floor["format"] = "variant"
+    other = mi.load_dict(described)
+    problem.assign(problem.initial, other)
+    params = mi.traverse(other)
+    assert params[eta] == pytest.approx(1.3) and np.array(params[TEXTURE]).max() == np.float32(0.25)
+    described["wall"]["bsdf"]["reflectance"] = {"type": "uniform", "value": 0.5}
+    with pytest.raises(PathreplayError, match=f"'{WALL}' is a Float in this scene and a Color3f in the problem's"):
+        problem.assign(problem.initial, mi.load_dict(described))
+
+
 def test_a_callback_ends_it_and_nothing_is_written(photos: list[np.ndarray], tmp_path: Path) -> None:
     seen: list[tuple[int, float]] = []
 

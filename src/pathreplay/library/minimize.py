@@ -57,7 +57,11 @@ class Result:
         return self.history[-1].loss if self.history else float("nan")
 
     def apply(self, scene: mi.Scene) -> None:
-        """Set the parameters of a scene to the resulting values, which the problem's own scene already has."""
+        """Set the parameters of a scene to the resulting values, which the problem's own scene already has.
+
+        Raises PathreplayError if the scene lacks a parameter, or stores it such that it cannot have the values. Load
+        8-bit textures with ``format = 'variant'``.
+        """
         self.problem.assign(self.values, scene)
 
     def render(self, view: int | str = 0, spp: int | None = None) -> Image:

@@ -28,6 +28,7 @@ from pathreplay.platform.device import require_order
 from pathreplay.platform.traversal import traversed
 from pathreplay.runs.run_folder import IN_MEMORY
 from pathreplay.scenes.loading import load_scene_for
+from pathreplay.scenes.parameters import SceneValue, get_array, require_settable
 from pathreplay.types import Json
 
 MOST_ITERATIONS = 10**6
@@ -244,7 +245,10 @@ class Problem:
         return built
 
     def assign(self, values: Arrays, scene: mi.Scene) -> None:
-        """Set the parameters of a scene to these values. Raises PathreplayError if the scene lacks one of them."""
+        """Set the parameters of a scene to these values.
+
+        Raises PathreplayError if the scene lacks a parameter, or stores it such that it cannot have the values.
+        """
         params, known = traversed(scene), self.built.scenes()
         found = [inner.scene_values(each, inner.variables_of(each, values)) for each in known]
         fitting = [each for each in found if each.keys() <= set(params.keys())]
@@ -252,9 +256,24 @@ class Problem:
             missing = next(key for key in found[0] if key not in params)
             raise PathreplayError(f"The scene has no parameter '{missing}'; give a scene with the problem's parameters")
         for each in fitting:
+            for key in each:
+                require_settable(params, key)
+        for each in fitting:
             for key, value in each.items():
-                params[key] = value
+                _put(params, key, value)
         params.update()
+
+
+def _put(params: mi.SceneParameters, key: str, value: SceneValue) -> None:
+    """Set a parameter, which some plugins store as a plain number. Raises PathreplayError if the types do not fit."""
+    stored = params[key]
+    try:
+        params[key] = float(get_array(value).item()) if isinstance(stored, float) else value
+    except (RuntimeError, TypeError, ValueError):
+        raise PathreplayError(
+            f"Parameter '{key}' is a {type(stored).__name__} in this scene and a {type(value).__name__} in the "
+            "problem's; give a scene with the same plugins"
+        ) from None
 
 
 def run_settings(name: str, steps: int | None, options: Json | None, settings: Mapping[str, object]) -> Json:
