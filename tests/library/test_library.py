@@ -383,6 +383,22 @@ def test_stages_take_the_place_of_steps(photos: list[np.ndarray]) -> None:
     assert len(again.history) == 3 and "3 iterations" in repr(again) and WALL in repr(problem)
 
 
+@pytest.mark.parametrize("key", [TEXTURE, "floor.*.data"])
+def test_grids_are_refined_at_the_stages_of_the_minimisation(key: str, photos: list[np.ndarray]) -> None:
+    """Not at those of the problem, which stay what they are."""
+    own = [{"iterations": 1}, {"iterations": 4}]
+    problem = Problem(room(), {key: Parameter(resolutions=[2, 4])}, views(photos), spp=2, stages=own)
+
+    def sides(**settings: Any) -> list[int]:
+        seen: list[int] = []
+        look = [lambda it: seen.append(len(it.values[TEXTURE]))]
+        pathreplay.minimize(problem, progress=False, callbacks=look, **settings)
+        return seen
+
+    assert sides(stages=[{"iterations": 3}, {"iterations": 1}]) == [2, 2, 2, 4]
+    assert sides() == [2, 4, 4, 4, 4]
+
+
 def test_a_problem_is_left_as_it_was(photos: list[np.ndarray]) -> None:
     problem = Problem(room(), {WALL: GREY}, views(photos), deterministic=True)
     f = pathreplay.value_and_grad(problem)

@@ -18,6 +18,7 @@ from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.losses.pixelwise import LOSSES
 from pathreplay.inverse.objective.reached import require_possible
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.variables import Variable, free_of, keys_of
 from pathreplay.inverse.problem import joint as inner_joint
 from pathreplay.inverse.problem import problem as inner
 from pathreplay.library.descriptions import Derived, Objects, Parameter, View, by_key, require_kinds
@@ -241,6 +242,8 @@ class Problem:
         built = replace(self.built, config=config)
         if isinstance(built, inner_joint.JointProblem):
             built = replace(built, parts=tuple(replace(part, config=config) for part in built.parts))
+        elif "stages" in changes:
+            built = replace(built, variables=_refined_in_stages(built))
         require_possible(built)
         return built
 
@@ -262,6 +265,18 @@ class Problem:
             for key, value in each.items():
                 _put(params, key, value)
         params.update()
+
+
+def _refined_in_stages(built: inner.Problem) -> tuple[Variable, ...]:
+    """Return the variables such that grids without ``refine_at`` are refined at the stages of the problem's config."""
+    config = built.config
+    named, _ = keys_of(built.params, config.parameters, config.derived, built.integrator)
+    entries = named | free_of(built.params, config.parameters)
+    refine_at = {key: config.completed_entry(entry).refine_at or [] for key, entry in entries.items()}
+    return tuple(
+        v if v.levels is None else replace(v, levels=replace(v.levels, begins=(0, *refine_at[v.key])))
+        for v in built.variables
+    )
 
 
 def _put(params: mi.SceneParameters, key: str, value: SceneValue) -> None:
