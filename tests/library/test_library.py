@@ -332,6 +332,22 @@ def test_a_pose_a_derived_parameter_and_arrays_as_starts(photos: list[np.ndarray
     np.testing.assert_allclose(np.array(mi.traverse(other)[BODY]), result.values[BODY].ravel(), atol=1e-6)
 
 
+def test_values_of_a_scene_are_initial_values_and_values(photos: list[np.ndarray]) -> None:
+    """As `mi.traverse` gives them; vertices may be points of Dr.Jit or rows, but not columns."""
+    params = mi.traverse(mi.load_dict(room()))
+    wanted = {key: Parameter(initial=params[key]) for key in (WALL, TEXTURE, BODY)}
+    problem = Problem(room(), wanted, views(photos))
+    np.testing.assert_allclose(problem.initial[WALL], [0.7, 0.3, 0.2], rtol=1e-5)
+    colour, flat = problem.initial[WALL], problem.initial[BODY]
+    points = dr.unravel(mi.Point3f, mi.Float(flat))
+    for value in (params[BODY], points, flat.reshape(-1, 3)):
+        np.testing.assert_array_equal(problem.complete({BODY: value})[BODY], flat)
+    for value in (params[WALL], mi.Vector3f(*map(float, colour)), colour[:, None], colour[None]):
+        np.testing.assert_array_equal(problem.complete({WALL: value})[WALL], colour)
+    with pytest.raises(PathreplayError, match="transpose it, so that each vertex is a row"):
+        problem.complete({BODY: np.array(points)})
+
+
 def test_values_go_to_another_scene_or_it_is_told(photos: list[np.ndarray], tmp_path: Path) -> None:
     """Which stores an index as a plain number, a texture as 8 bits, or one number in place of a colour."""
     PIL.Image.fromarray(np.full((4, 4, 3), 100, np.uint8)).save("texture.png")

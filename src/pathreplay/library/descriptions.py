@@ -11,6 +11,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.parameters.values import Array
+from pathreplay.scenes.parameters import get_array
 from pathreplay.types import Json
 
 
@@ -155,7 +156,8 @@ class Objects:
         if entry.regularizer is not None:
             table["regularizer"] = self.named(entry.regularizer)
         if isinstance(entry.initial, np.ndarray) or dr.is_array_v(entry.initial):
-            self.starts[key] = np.array(entry.initial, np.float32)
+            given = get_array(entry.initial) if dr.is_array_v(entry.initial) else entry.initial
+            self.starts[key] = np.array(given, np.float32)
             table["initial"] = None
             if entry.pose is not None:
                 raise PathreplayError(

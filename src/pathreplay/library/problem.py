@@ -308,11 +308,22 @@ def _require_none_of_views(settings: Mapping[str, object]) -> None:
 def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
     """Convert a value to the ``wanted`` shape of its parameter. Textures and grids may have another resolution.
 
-    Raises PathreplayError if the shape does not fit.
+    The entries of a flat parameter, such as vertices, may be rows of an array, or points of Dr.Jit. Raises
+    PathreplayError if the shape does not fit.
     """
-    array = np.array(dr.detach(value) if dr.is_array_v(value) else value, np.float32)
+    if dr.is_array_v(value):
+        points = not dr.is_tensor_v(value) and dr.depth_v(value) > 1 and len(wanted) == 1
+        value = get_array(dr.ravel(value) if points else value)
+    array = np.array(value, np.float32)
     resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
-    if array.shape != wanted and not resized and not (len(wanted) == 1 and array.size == wanted[0]):
+    rows = len(wanted) == 1 and array.size == wanted[0]
+    of_vertices = key.rpartition(".")[2].startswith("vertex_")
+    if rows and of_vertices and array.ndim > 1 and array.shape[0] < array.shape[-1]:  # (3, n) in place of (n, 3)
+        raise PathreplayError(
+            f"Value of '{key}' has the shape {array.shape}, not the shape {wanted}; transpose it, so that each vertex "
+            "is a row"
+        )
+    if array.shape != wanted and not resized and not rows:
         raise PathreplayError(f"Value of '{key}' has the shape {array.shape}, not the shape {wanted}; reshape it")
     return array if resized else array.reshape(wanted)
 
