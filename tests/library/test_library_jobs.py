@@ -119,6 +119,20 @@ def test_targets_of_files_and_masks_go_along(place: Path) -> None:
         np.testing.assert_array_equal(result.values[KEY], job.parameters[KEY])
 
 
+def test_captures_of_several_jobs_are_joint(place: Path) -> None:
+    """Cameras and images are those of each capture."""
+    camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+    for n in (0, 1):
+        (place / f"photo{n}.exr").write_bytes(exr_bytes(np.full((4, 6, 3), 0.2 + 0.2 * n, np.float32)))
+        frames = [{"file_path": f"photo{n}.exr", "transform_matrix": camera}]
+        (place / f"capture{n}.json").write_text(json.dumps({"camera_angle_x": 0.6, "frames": frames}))
+    job = {key: value for key, value in JOB.items() if key not in ("target", "sensors")}
+    captures = [load_job(written(place, {**job, "capture": {"transforms": f"capture{n}.json"}})) for n in (0, 1)]
+    result = pathreplay.minimize(pathreplay.Problem.joint(captures), steps=2, progress=False, output="run")
+    assert [view.target.max() for view in result.problem.built.views] == [np.float32(0.2), np.float32(0.4)]
+    assert len(result.history) == 2
+
+
 @pytest.mark.parametrize(
     ("job", "changes", "words"),
     [

@@ -173,6 +173,7 @@ class Problem:
             "test_views": [name for name, view in seen.items() if view.is_test],
             "view_weights": {name: view.share for name, view in seen.items() if view.share != 1},
         }  # fmt: skip
+        joint.job.pop("capture", None)  # its cameras and images are among the views
         config = first.built.config.model_copy(update={"parameters": make_config(joint.job).parameters})
         joint.built = inner_joint.joined([problem.built for problem in problems], config)
         return joint
