@@ -111,5 +111,7 @@ def test_what_cannot_be_stepped_is_told(photos: list[np.ndarray]) -> None:
         pathreplay.step(problem_of(photos), state)
     with pytest.raises(PathreplayError, match="has no state_dict"):
         pathreplay.init(problem, Descent())
+    with pytest.raises(PathreplayError, match=r"init: executor = 'ray' is for minimize.*set executor to 'local'"):
+        pathreplay.init(problem, executor="ray")
     with pytest.raises(PathreplayError, match="init: unknown key 'warm_up'"):
         pathreplay.init(problem, warm_up=3)

@@ -37,10 +37,18 @@ class _Task:
         self.optimiser: adaptive.Optimiser | None = None
 
     def of(self, problem: Problem, name: str = "step") -> tuple[inner.Problem, Executor]:
-        """Return ``problem`` with the changed settings, and its executor. Error messages begin with ``name``."""
+        """Return ``problem`` with the changed settings, and its executor. Error messages begin with ``name``.
+
+        Raises PathreplayError if a setting is invalid, or the problem's ``executor`` is not ``local``.
+        """
         if problem not in self._known:
             built = problem.configured(self._changes, name)
             config = built.config
+            if config.executor != "local":
+                raise PathreplayError(
+                    f"{name}: executor = '{config.executor}' is for minimize, and steps are computed in this process; "
+                    "set executor to 'local'"
+                )
             executor = Local(evaluator_of(built, built.integrator, config.integrator))
             self._known[problem] = built, executor
         return self._known[problem]
@@ -99,7 +107,7 @@ def init(
         The state before the first step.
 
     Raises:
-        PathreplayError: the settings are invalid.
+        PathreplayError: the settings are invalid, or ``executor`` is not ``local``.
     """
     options, own = options_of(optimizer)
     task = _Task(run_settings("init", steps, options, settings))
