@@ -7,6 +7,7 @@ import json
 import shlex
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -18,7 +19,8 @@ import pytest
 from pathreplay import cli
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.schema import PICTURE, Capture
-from pathreplay.inverse.dataset.capture import read_capture
+from pathreplay.inverse.dataset.capture import pinhole_camera, read_capture
+from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.inverse.images.io import exr_bytes, read_image
 from pathreplay.jobs import make_config, optimize
 from pathreplay.output.export import export_run, write_files
@@ -238,6 +240,30 @@ def test_integrators_for_gradients_have_one_for_pictures_in_their_place(wanted: 
     options = {each.get("name"): int(str(each.get("value"))) for each in element}
     assert {"type": element.get("type"), **options} == plain
     assert bool(found.notes) == (wanted is not None and wanted["type"] != "direct")
+
+
+FOGGY = """<scene version="3.0.0">
+<integrator type="pathreplay"><integer name="max_depth" value="4"/></integrator>
+<shape type="cube" id="box"><bsdf type="null"/><medium type="homogeneous" name="interior" id="field">
+  <float name="sigma_t" value="1"/><rgb name="albedo" value="0.2"/></medium></shape>
+<emitter type="constant" id="sky"><rgb name="radiance" value="1"/></emitter>
+</scene>"""
+
+
+def test_cameras_inside_a_medium_come_out_inside_it(tmp_path: Path) -> None:
+    """As `[capture] medium` puts them: the fog of thickness 2 or so hides most of the sky."""
+    (tmp_path / "fog.xml").write_text(FOGGY)
+    lens = Lens(8, 8, 9.0, 9.0, 4.0, 4.0)
+    camera = pinhole_camera(lens, np.eye(4), (8, 8), 0.01)
+    cameras = {name: {**camera, "id": name} for name in ("left", "right")}
+    key = "box.interior_medium.sigma_t.value.value"
+    source = Source(tmp_path / "fog.xml", {}, {}, cameras, medium="field")
+    found = exported(source, {key: np.float32([2.0])})
+    same_pictures(found, tmp_path / "out")
+    assert all(image.mean() < 0.5 for image in pictures(loaded(tmp_path / "out"), found.scene.integrator()))
+    gc.collect()
+    with pytest.raises(PathreplayError, match=r"capture\.medium 'mist' is the id of no medium of the scene"):
+        exported(replace(source, medium="mist"), {})
 
 
 # ------------------------------ A run ------------------------------

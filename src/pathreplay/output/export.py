@@ -116,17 +116,18 @@ def _source(job: Job, values: Arrays) -> Source:
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, job.base, picture_size, film)
     cameras = {name: shot.camera for name, shot in shots.items()}
+    medium = None if config.capture is None else config.capture.medium
     plugins = {"dielectric": "dielectric_ad"} if any(key.endswith(".eta") for key in values) else {}
     if job.in_python and config.scene == IN_MEMORY:
         raise PathreplayError(
             "The run was started in Python with a scene object; set the values of a scene with result.apply(scene)"
         )
     if config.scene in BUILTINS:
-        return Source(builtin_dict(config.scene, config.scene_parameters), {}, plugins, cameras)
+        return Source(builtin_dict(config.scene, config.scene_parameters), {}, plugins, cameras, medium=medium)
     path = job.base / config.scene
     if not path.is_file():
         raise PathreplayError(f"Scene {path} of the run no longer exists; restore it")
-    source = Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras)
+    source = Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras, medium=medium)
     return replace(source, floats=_floats(source, values))
 
 

@@ -81,6 +81,7 @@ def describe(
     plugins: Mapping[str, str],
     cameras: Mapping[str, Mapping[str, object]],
     floats: Collection[str] = (),
+    medium: str | None = None,
 ) -> tuple[Described, list[Owner]]:
     """Parse a scene into its objects and the owners of its parameters, in the order of `mi.traverse`.
 
@@ -90,10 +91,11 @@ def describe(
         plugins: new plugin types by the old types that they replace.
         cameras: dictionaries of additional sensors by id.
         floats: image files whose textures are stored as floating-point numbers; see `load_file_with`.
+        medium: id of the medium that surrounds the additional sensors.
 
     Raises:
         RuntimeError: Mitsuba cannot read the scene.
-        PathreplayError: see `load_file_with`.
+        PathreplayError: see `load_file_with`, or the scene has no such medium.
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
@@ -111,6 +113,8 @@ def describe(
             exchange(node.props, plugins, floats)
         require_sound_files(state)
         mi.parser.transform_all(config, state)
+        if medium is not None:
+            _surround(state, cameras, medium)
         described = Described(state, folder)
         owners = [_deepest(described, owner) for owner in _owners(config, state, described.nodes)]
     return described, owners
@@ -126,6 +130,19 @@ def _join(state: mi.parser.ParserState, name: str, camera: mi.parser.ParserState
         state.nodes.append(node)
     state.nodes[offset].props.set_id(name)
     state.root.props[name] = mi.Properties.ResolvedReference(offset)
+
+
+def _surround(state: mi.parser.ParserState, cameras: Collection[str], medium: str) -> None:
+    """Let sensors, given by id, reference the medium of the scene with the id ``medium``."""
+    kind = mi.ObjectType.Medium
+    index = next((i for i, node in enumerate(state.nodes) if node.type == kind and node.props.id() == medium), None)
+    if index is None:
+        raise PathreplayError(
+            f"capture.medium '{medium}' has no description in the scene that is exported; give the medium this id"
+        )
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Sensor and node.props.id() in cameras:
+            node.props["medium"] = mi.Properties.ResolvedReference(index)
 
 
 def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes: list[Node]) -> list[Owner]:

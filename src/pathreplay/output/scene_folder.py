@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.dataset.capture import put_inside
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.output.nodes import Described, describe, require_no_objects
 from pathreplay.output.placed import Placing, copied_files, made_otherwise
@@ -58,12 +59,18 @@ class Source:
     """Additional sensors by id."""
     floats: Collection[str] = ()
     """Image files whose textures are stored as floating-point numbers; see `load_file_with`."""
+    medium: str | None = None
+    """Id of the medium that surrounds the additional sensors."""
 
     def load(self) -> mi.Scene:
-        """Load the scene. Raises the errors of Mitsuba and of `load_file_with`."""
+        """Load the scene. Raises the errors of Mitsuba, of `load_file_with` and of `put_inside`."""
         if isinstance(self.scene, Mapping):
-            return load_dict_with(self.scene, self.plugins, self.cameras, self.floats)[0]
-        return load_file_with(self.scene, self.plugins, self.arguments, self.cameras, self.floats)[0]
+            scene = load_dict_with(self.scene, self.plugins, self.cameras, self.floats)[0]
+        else:
+            scene = load_file_with(self.scene, self.plugins, self.arguments, self.cameras, self.floats)[0]
+        if self.medium is not None:
+            put_inside(scene, set(self.cameras), self.medium)
+        return scene
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,9 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
     with errors_as("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene = source.load()
         params = _set(scene, values)
-        described, owners = describe(source.scene, source.arguments, source.plugins, source.cameras, source.floats)
+        described, owners = describe(
+            source.scene, source.arguments, source.plugins, source.cameras, source.floats, source.medium
+        )
     keys = list(params.keys())
     if len(keys) != len(owners):
         raise PathreplayError("The scene differs each time it is loaded, and cannot be exported")
