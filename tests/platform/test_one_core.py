@@ -71,3 +71,30 @@ def test_a_check_of_a_scene_with_pictures_ends(room: Path, run_python) -> None:
     done = run_python(ON_ONE_CORE, args=("check", "ball.xml", "--param", "sky.scale", "--seeds", "2", "--spp", "1"))
     assert done.returncode in (0, 1), done.stderr
     assert "1 checked" in done.stdout
+
+
+SURFACE = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from pathreplay.platform.backend import set_variant
+set_variant("llvm_ad_rgb")
+from pathlib import Path
+import numpy as np
+from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.output import surface_scene
+Path("sky.exr").write_bytes(exr_bytes(np.full((128, 256, 3), 0.5, np.float32)))
+density = np.zeros((8, 8, 8), np.float32)
+density[2:6, 2:6, 2:6] = 50
+mesh = surface_scene.emitting_mesh(density, np.ones((8, 8, 8, 3), np.float32), np.zeros(3), np.ones(3))
+mesh.write_ply("surface.ply")
+Path("scene.xml").write_text(surface_scene.surface_xml([], True))
+print(surface_scene._error(Path("scene.xml"), []))
+"""
+
+
+def test_the_scene_of_a_surface_with_a_sky_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_python) -> None:
+    """The sky of an exported surface is an EXR file of several blocks, which Mitsuba's pool of threads reads."""
+    monkeypatch.chdir(tmp_path)
+    done = run_python(SURFACE)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["0.0"]

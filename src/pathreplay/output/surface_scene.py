@@ -17,6 +17,7 @@ from pathreplay.output.export import run_result
 from pathreplay.output.surfaces import surface
 from pathreplay.platform import backend, compat
 from pathreplay.platform.atomic_files import whole_folder
+from pathreplay.platform.threads import spare_thread
 from pathreplay.runs.run_folder import Job, read_job, require_writable_name
 from pathreplay.scenes.loading import load_scene
 from pathreplay.types import SceneDict
@@ -117,7 +118,8 @@ def _error(scene: Path, targets: list[np.ndarray]) -> float:
 
     Each image is first multiplied by one factor per colour, so that its mean colour is that of its target.
     """
-    loaded, error = mi.load_file(str(scene)), 0.0
+    with spare_thread():
+        loaded, error = mi.load_file(str(scene)), 0.0
     for k, target in enumerate(targets):
         image = np.array(mi.render(loaded, sensor=k, spp=SPP))
         gain = target.mean((0, 1)) / np.maximum(image.mean((0, 1)), 1e-6)
