@@ -175,6 +175,20 @@ def test_a_given_mesh_gets_a_reflectance(capture: Path, tmp_path: Path) -> None:
     assert any("reflectance" in key or "vertex_color" in key for key in keys)
 
 
+@pytest.mark.parametrize("alpha", ["", " 255"])
+def test_the_colours_of_a_given_mesh_are_replaced(alpha: str, capture: Path, tmp_path: Path) -> None:
+    """Scanners write PLY files with a colour per vertex, sometimes with alpha, and without texture coordinates."""
+    channels = ["red", "green", "blue"] + ["alpha"] * bool(alpha)
+    head = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
+    head += [*(f"property uchar {name}" for name in channels), "element face 1"]
+    head += ["property list uchar int vertex_indices", "end_header"]
+    rows = [f"0 0 0 255 0 0{alpha}", f"1 0 0 0 255 0{alpha}", f"0 1 0 0 0 255{alpha}", "3 0 1 2"]
+    (tmp_path / "scan.ply").write_text("\n".join([*head, *rows, ""]))
+    written = pathreplay.from_photos(capture, tmp_path / "job", mesh=tmp_path / "scan.ply", minutes=0.01)
+    colours = mi.traverse(mi.load_file(str(written.folder / "scene.xml")))["mesh.vertex_color"]
+    assert np.array(colours) == pytest.approx([0.5] * 9)
+
+
 def test_prepared_images_are_those_of_a_pinhole(tmp_path: Path) -> None:
     """A photo of a distorting lens with oblong pixels, of a pattern whose undistorted image is known."""
     lens = Lens(160, 120, 150.0, 165.0, 84.0, 58.0, (0.08, -0.03, 0.0, 0.0, 0.0, 0.0), (0.002, -0.001))

@@ -16,6 +16,8 @@ from pathreplay.scenes.descriptions import errors_as
 
 GREY = 0.5
 """Initial reflectance."""
+COLOUR = "vertex_color"
+"""Attribute with the reflectance of the vertices. Mitsuba gives this name to the colours in a PLY file."""
 KINDS = (".ply", ".obj")
 
 
@@ -40,7 +42,7 @@ class Proxy:
     @property
     def key(self) -> str:
         """Key of the reflectance."""
-        return "mesh.bsdf.brdf_0.reflectance.data" if self.textured else "mesh.vertex_color"
+        return "mesh.bsdf.brdf_0.reflectance.data" if self.textured else f"mesh.{COLOUR}"
 
     def write(self, folder: Path) -> None:
         """Write the file into a folder; a mesh without texture coordinates gets a colour per vertex."""
@@ -49,7 +51,9 @@ class Proxy:
             shutil.copyfile(self.path, target)
             return
         mesh = _loaded(self.path)
-        mesh.add_attribute("vertex_color", 3, np.full(3 * mesh.vertex_count(), GREY, np.float32))
+        if COLOUR in mi.traverse(mesh):  # the mesh has colours of its own, with 3 or 4 channels
+            mesh.remove_attribute(COLOUR)
+        mesh.add_attribute(COLOUR, 3, np.full(3 * mesh.vertex_count(), GREY, np.float32))
         mesh.write_ply(str(target))
 
 
