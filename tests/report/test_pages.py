@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import json
 import re
 from html.parser import HTMLParser
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from page_samples import HOSTILE, sample
 from pathreplay.inverse.loop.checkpoint import Entry
+from pathreplay.report.drawing import own_settings
+from pathreplay.report.outcome import Recovered, ViewPictures
 from pathreplay.report.page_parts import common_exposure, plots
 from pathreplay.report.pages.document import document
 from pathreplay.report.pages.page import MOST_POINTS, thinned
+from pathreplay.report.report import summary
 
 
 class Elements(HTMLParser):
@@ -88,3 +95,17 @@ def test_a_parameter_that_the_last_stage_freezes_keeps_its_curve() -> None:
 def test_one_exposure_is_that_of_all_pixels_together() -> None:
     dark, bright = np.full((4, 4, 3), 0.5, np.float32), np.full((4, 4, 3), 2.0, np.float32)
     assert common_exposure([dark]) == pytest.approx(2) and common_exposure([dark, bright]) == pytest.approx(0.5)
+
+
+@pytest.mark.drawn
+@pytest.mark.parametrize("shape", [(2100, 1, 1), (1, 2100, 3), (3, 2, 3)])
+def test_the_sheet_of_a_run_has_room_for_images_of_any_shape(shape: tuple[int, ...]) -> None:
+    """Rows of images have at most 8 times the height of their width, and at least an eighth."""
+    values = np.linspace(0, 1, int(np.prod(shape)), dtype=np.float32).reshape(shape)
+    item = Recovered("curve", "curve", values, values, None)
+    view = ViewPictures("eye", *3 * (np.full((8, 8, 3), 0.5, np.float32),), exposure=1.0)
+    outcome: Any = SimpleNamespace(views=[view], recovered=[item], caption=str)
+    with own_settings(), PIL.Image.open(io.BytesIO(summary(outcome))) as sheet:
+        width, height = sheet.size
+    ratio = min(max(shape[0] / shape[1], 1 / 8), 8)
+    assert width == 4 * 210 and height == pytest.approx(40 + 210 + 210 * ratio, abs=2)

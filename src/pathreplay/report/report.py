@@ -304,6 +304,8 @@ def _plain(axes: Axes, along: str) -> None:
 SUMMARY_ROWS = 3
 SUMMARY_SIDE = 512
 """Side in pixels to which larger images are downscaled, to save memory. Images are drawn with a width of 210 pixels."""
+SUMMARY_ASPECT = 8.0
+"""Largest ratio of the sides of a drawn image. Longer images, such as a texture with one column, are distorted."""
 
 
 def summary(outcome: Outcome) -> bytes:
@@ -316,15 +318,18 @@ def summary(outcome: Outcome) -> bytes:
     rows += [(key, images, 1.0) for key, images in [row for row in grids if row[1]][:SUMMARY_ROWS]]
     columns = max(len(images) for _, images, _ in rows)
     # Row heights in inches: images are 2.1 inches wide, and titles are 0.2 inches high.
-    heights = [0.2 + 2.1 * image.shape[0] / image.shape[1] for _, images, _ in rows for image in [images["start"]]]
+    ratios = [image.shape[0] / image.shape[1] for _, images, _ in rows for image in [images["start"]]]
+    heights = [0.2 + 2.1 * min(max(ratio, 1 / SUMMARY_ASPECT), SUMMARY_ASPECT) for ratio in ratios]
     figure = Figure(figsize=(2.1 * columns, sum(heights)), layout="constrained", dpi=100)
     grid = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
-    for line, (name, pictures, exposure) in zip(grid, rows, strict=True):
+    for line, (name, pictures, exposure), ratio in zip(grid, rows, ratios, strict=True):
+        undistorted = 1 / SUMMARY_ASPECT <= ratio <= SUMMARY_ASPECT
         for axes in line:
             axes.axis("off")
         for column, (kind, image) in enumerate(pictures.items()):
             pixels = displayed(shown(image, SUMMARY_SIDE), exposure)
             line[column].imshow(pixels, interpolation="nearest", vmin=0, vmax=1, cmap="gray")
+            line[column].set_aspect("equal" if undistorted else "auto")
             label = outcome.caption(kind)
             short = name if len(name) <= 24 else f"…{name[-23:]}"  # a longer title is wider than an image
             line[column].set_title(label if column else f"{short}: {label}", fontsize=8)
