@@ -17,6 +17,8 @@ import pytest
 
 from pathreplay import cli
 from pathreplay.errors import PathreplayError
+from pathreplay.integrators.path_limits import Limits
+from pathreplay.integrators.stateful import stateful
 from pathreplay.scenes.parameters import get_array
 from pathreplay.testing import check_gradient, command
 from pathreplay.testing.direction import choose_line
@@ -216,6 +218,36 @@ def test_choice_of_integrators() -> None:
     assert in_it.class_name() == "VolumetricPathIntegrator"
     clear = reference_integrator(None, mi.load_dict({"type": "scene"}), scene.integrator())
     assert clear.class_name() == "PathIntegrator"
+
+
+@pytest.mark.parametrize("kind", ["prb", "prb_basic", "prbvolpath"])
+def test_another_depth_leaves_the_scenes_own_integrator(kind: str) -> None:
+    own = {"type": kind, "max_depth": 6, "rr_depth": 9, "hide_emitters": True}
+    scene = mi.load_dict({"type": "scene", "integrator": own})
+    tested = integrator_under_test(None, scene, max_depth=3)
+    assert type(tested) is type(scene.integrator())
+    assert read_limits(tested) == Limits(3, 9, True)
+    assert read_limits(scene.integrator()) == Limits(6, 9, True)
+
+
+def test_another_depth_or_boundary_leaves_the_other_properties_of_an_own_pathreplay() -> None:
+    own = {"type": "pathreplay", "max_depth": 6, "attach": "all", "sampling": "scene", "adjoint": "replay"}
+    scene = mi.load_dict({"type": "scene", "integrator": own})
+    options = stateful(scene.integrator()).options()
+    deep = integrator_under_test(None, scene, max_depth=3)
+    assert stateful(deep).options() == options and options["attach"] == "all" and options["sampling"] == "scene"
+    assert read_limits(deep) == Limits(3, 5, False)
+    scene = mi.load_dict({"type": "scene", "integrator": {**own, "attach": "delta"}})
+    edges = integrator_under_test(None, scene, boundary={"boundary": "primary"})
+    assert stateful(edges).options() == options | {"attach": "delta", "boundary": "primary"}
+
+
+def test_another_depth_of_an_integrator_with_unknown_properties_is_refused() -> None:
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "prb_projective", "sppi": 0}})
+    assert integrator_under_test(None, scene) is scene.integrator()
+    assert read_limits(integrator_under_test("prb_projective", scene, max_depth=3)) == Limits(3, 5, False)
+    with pytest.raises(PathreplayError, match=r"own PathProjectiveIntegrator, .*; set it in the scene, or name"):
+        integrator_under_test(None, scene, max_depth=3)
 
 
 # ------------------------------------------------------------------------------

@@ -27,6 +27,9 @@ LONGEST_WITHOUT_ROULETTE = 64
 """Largest ``max_depth`` at which the reference disables Russian roulette. Without roulette, paths in a closed room end
 only at ``max_depth``."""
 
+_ONLY_LIMITS = {"PRBIntegrator": "prb", "BasicPRBIntegrator": "prb_basic", "PRBVolpathIntegrator": "prbvolpath"}
+"""Plugins by class, for the differentiable integrators of Mitsuba that have no other properties than `Limits`."""
+
 
 def integrator_under_test(
     spec: Spec, scene: mi.Scene, max_depth: int | None = None, boundary: Mapping[str, object] | None = None
@@ -35,10 +38,12 @@ def integrator_under_test(
 
     None selects the scene's own integrator if it is differentiable, else ``pathreplay``. A plugin given by name, or
     selected by None, gets the path limits of the scene's own integrator. ``max_depth`` replaces the path length of the
-    integrator. ``boundary`` contains additional properties of `pathreplay` (``boundary``, ``boundary_spp``).
+    integrator. ``boundary`` contains additional properties of `pathreplay` (``boundary``, ``boundary_spp``). With
+    ``boundary``, None selects `pathreplay`. If the scene's own integrator is selected, it keeps its other properties.
 
     Raises PathreplayError if Mitsuba cannot create the integrator, if ``max_depth`` is invalid or given with an object,
-    or if boundary terms are requested from another integrator than `pathreplay`.
+    if the other properties of the scene's own integrator cannot be read to replace its ``max_depth``, or if boundary
+    terms are requested from another integrator than `pathreplay`.
     """
     if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
         raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
@@ -54,9 +59,11 @@ def integrator_under_test(
         description = dict(spec)
     else:
         limits = None if own is None else read_limits(own)
-        description = {"type": spec or "pathreplay", **({} if limits is None else vars(limits))}
-        options = {} if own is None or description["type"] != "pathreplay" else stateful(own).options()
-        description |= {name: options[name] for name in ("boundary", "boundary_spp", "caustics") if name in options}
+        name = spec or ("pathreplay" if boundary else _own_name(own))
+        description = {"type": name, **({} if limits is None else vars(limits))}
+        options = {} if own is None or name != "pathreplay" else stateful(own).options()
+        kept = ("boundary", "boundary_spp", "caustics") if spec else tuple(options)
+        description |= {option: options[option] for option in kept if option in options}
     if max_depth is not None:
         description["max_depth"] = max_depth
     if boundary and description.get("type") != "pathreplay":
@@ -65,6 +72,22 @@ def integrator_under_test(
             "'pathreplay', or leave it out"
         )
     return load_integrator(description | dict(boundary or {}))
+
+
+def _own_name(own: mi.Integrator | None) -> str:
+    """Return the plugin that continues the scene's own integrator with another ``max_depth``.
+
+    Raises PathreplayError if the integrator is differentiable, and may have properties that cannot be read.
+    """
+    if not isinstance(own, mi.CppADIntegrator) or stateful(own).options():
+        return "pathreplay"
+    name = type(own).__name__
+    if name not in _ONLY_LIMITS:
+        raise PathreplayError(
+            f"max_depth cannot be given for the scene's own {name}, whose other properties would be lost; set it in "
+            "the scene, or name the integrator"
+        )
+    return _ONLY_LIMITS[name]
 
 
 def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> mi.Integrator:
