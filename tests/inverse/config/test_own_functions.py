@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.user_functions import Imported
+from pathreplay.inverse.config.user_functions import Imported, Modules
 from pathreplay.jobs import make_config, optimize
 from room_job import JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
@@ -158,3 +159,54 @@ def test_what_fails_in_the_first_iteration_leaves_no_folder(room: Path) -> None:
         with pytest.raises(PathreplayError, match="no more"):
             optimize(make_config({**JOB, "loss": "own:leaves_later", "output": output}), progress=False)
         assert not (room / "runs").exists() and list((room / "kept").iterdir()) == []
+
+
+def folder_of_modules(folder: Path, factor: int) -> Modules:
+    """A folder with a package, and a module that imports another one only when it is called."""
+    (folder / "tools").mkdir(parents=True)
+    (folder / "tools/__init__.py").write_text(f"FACTOR = {factor}\ndef f(x):\n    return FACTOR * x\n")
+    (folder / "tools/sub.py").write_text("from . import FACTOR\ndef f(x):\n    return 10 * FACTOR * x\n")
+    (folder / "tools/late.py").write_text("def f(x):\n    from .sub import f as inner\n    return inner(x)\n")
+    (folder / "calls.py").write_text(
+        "def f(x):\n    import helper, tools\n    helper.calls.append(x)\n    return len(helper.calls) * tools.f(x)\n"
+    )
+    (folder / "helper.py").write_text("calls = []\n")
+    return Modules(folder)
+
+
+def test_packages_and_late_imports_are_found_in_the_folder_of_each_job(tmp_path: Path) -> None:
+    before, path = dict(sys.modules), list(sys.path)
+    folders = [folder_of_modules(tmp_path / str(k), k) for k in (2, 3)]
+    names = ("tools.sub:f", "tools:f", "tools.late:f", "calls:f")
+    functions = [[modules.function("Loss", name, "x") for name in names] for modules in folders]
+    values = [[function(float, 1.0) for function in own] for own in functions]
+    assert values == [[20.0, 2.0, 20.0, 2.0], [30.0, 3.0, 30.0, 3.0]]
+    assert functions[0][3](float, 1.0) == 4.0  # the second call of this job's helper
+    assert sys.modules == before and sys.path == path
+
+
+def test_a_package_of_the_folder_hides_a_loaded_one_only_in_the_job(tmp_path: Path) -> None:
+    (tmp_path / "json").mkdir()
+    (tmp_path / "json/__init__.py").write_text("def loads(x):\n    return 7\n")
+    loaded = {name: module for name, module in sys.modules.items() if name.partition(".")[0] == "json"}
+    assert "json.decoder" in loaded
+    assert Modules(tmp_path).function("Loss", "json:loads", "x")(int, "1") == 7
+    assert {name: sys.modules[name] for name in loaded} == loaded
+    (tmp_path / "json/__init__.py").write_text("import json.nothing\n")
+    with pytest.raises(PathreplayError, match=r"cannot be imported \(No module named 'json.nothing'\)"):
+        Modules(tmp_path).function("Loss", "json:loads", "x")
+    assert {name: sys.modules[name] for name in loaded} == loaded
+
+
+def test_installed_packages_within_the_folder_stay_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A virtual environment may be in the folder of the job."""
+    packages = tmp_path / ".venv/packages"
+    (packages / "installed_there").mkdir(parents=True)
+    (packages / "installed_there/__init__.py").write_text("VALUE = 5\n")
+    monkeypatch.syspath_prepend(str(packages))
+    (tmp_path / "own.py").write_text("import installed_there\ndef f(x):\n    return installed_there.VALUE\n")
+    try:
+        assert Modules(tmp_path).function("Loss", "own:f", "x")(int, 1) == 5
+        assert "installed_there" in sys.modules and "own" not in sys.modules
+    finally:
+        sys.modules.pop("installed_there", None)

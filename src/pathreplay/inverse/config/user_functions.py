@@ -6,8 +6,9 @@ import importlib
 import importlib.util
 import numbers
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -25,6 +26,9 @@ T = TypeVar("T")
 DEEPEST = 8
 """Deepest nesting of lists in a return value."""
 
+_IMPORTS = threading.RLock()
+"""Held while `sys.path` and `sys.modules` are those of one job."""
+
 
 @dataclass(frozen=True, eq=False)  # the function may be an object without a hash
 class Imported:
@@ -33,6 +37,8 @@ class Imported:
     kind: str
     name: str
     function: Callable[..., object]
+    surroundings: Callable[[], AbstractContextManager[None]] = nullcontext
+    """Block in which the function is called."""
 
     def __str__(self) -> str:
         return f"{self.kind} '{self.name}'"
@@ -43,7 +49,7 @@ class Imported:
         Raises PathreplayError if the function or the conversion raises, or if the return value is not numeric.
         """
         try:
-            with _same_variant(str(self)):
+            with self.surroundings(), _same_variant(str(self)):
                 value = self.function(*args)
             if wrong := _no_numbers(value):
                 raise PathreplayError(f"{self} returns {wrong}; return numbers or Dr.Jit arrays")
@@ -57,13 +63,15 @@ class Imported:
 class Modules:
     """Finds and imports user functions.
 
-    Modules in the folder ``base`` take precedence over installed modules. Each module is executed once. ``given`` maps
-    names to callables, which take precedence over modules.
+    Modules and packages in the folder ``base`` take precedence over installed ones. Each module is executed once.
+    Functions of the folder can import other modules of the folder, also when they are called. ``given`` maps names to
+    callables, which take precedence over modules.
     """
 
     def __init__(self, base: Path | None = None, given: Mapping[str, Callable[..., object]] | None = None) -> None:
-        self._base, self._given = base, dict(given or {})
+        self._base, self._given = None if base is None else base.resolve(), dict(given or {})
         self._known: dict[str, ModuleType] = {}
+        self._executed: dict[str, ModuleType] = {}  # modules of the folder, also those that other modules import
 
     def function(self, kind: str, name: str, takes: str) -> Imported:
         """Import a function; this executes its module on first use.
@@ -91,36 +99,86 @@ class Modules:
             raise PathreplayError(why) from None
         if not callable(imported):
             raise PathreplayError(f"{kind} '{name}' is not a function of {takes}, but {shown(imported)}; name another")
-        return Imported(kind, name, imported)
+        return Imported(kind, name, imported, self._searched_first if module in self._executed else nullcontext)
 
     def _loaded(self, name: str) -> ModuleType:
         """Execute a module of the folder ``base``, or import an installed one.
 
         A module of the folder is executed even if a module of the same name is already loaded, e.g. from another
-        folder. During the execution, imports search ``base`` first, as if Python had been started there.
+        folder.
         """
-        path = None if self._base is None else self._base / f"{name}.py"
-        if self._base is None or path is None or not path.is_file():
+        root, path = self._place(name)
+        if path is None:
             return importlib.import_module(name)
-        spec = importlib.util.spec_from_file_location(name, path)
-        if spec is None or spec.loader is None:
-            raise ImportError(f"{path} is not a module")
-        module = importlib.util.module_from_spec(spec)
-        folder, before = str(self._base.resolve()), dict(sys.modules)
-        sys.path.insert(0, folder)
-        sys.modules[name] = module
-        try:
-            spec.loader.exec_module(module)
-        finally:
-            sys.path.remove(folder)
-            for key, loaded in list(sys.modules.items()):
-                if key not in before and Path(getattr(loaded, "__file__", None) or "").parent == Path(folder):
+        with self._searched_first(root):
+            if root not in sys.modules:
+                _execute(root, path)
+            return sys.modules[root] if root == name else importlib.import_module(name)
+
+    def _place(self, name: str) -> tuple[str, Path | None]:
+        """Return the outermost package of a module, and its file in the folder ``base``, or None if there is none."""
+        package = _root(name)
+        if self._base is not None:
+            if (file := self._base / f"{name}.py").is_file():
+                return name, file
+            if package and (file := self._base / package / "__init__.py").is_file():
+                return package, file
+        return package, None
+
+    @contextmanager
+    def _searched_first(self, root: str = "") -> Iterator[None]:
+        """Let imports search the folder ``base`` first, as if Python had been started there.
+
+        Within the block, `sys.modules` has the modules of the folder that were executed by this object. Afterwards,
+        they are hidden from other folders with modules of the same names. If ``root`` is given, a module of this name
+        that is already loaded, and the modules within it, are hidden in the block.
+        """
+        folder = str(self._base)
+        with _IMPORTS:
+            before = dict(sys.modules)
+            for key in before if root else ():
+                if _root(key) == root:
                     del sys.modules[key]
-            if name in before:
-                sys.modules[name] = before[name]
-            else:
-                sys.modules.pop(name, None)
-        return module
+            sys.modules.update(self._executed)
+            sys.path.insert(0, folder)
+            try:
+                yield
+            finally:
+                with suppress(ValueError):  # user code may change the list
+                    sys.path.remove(folder)
+                for key, module in list(sys.modules.items()):
+                    if module is not before.get(key) and (_root(key) == root or self._is_own(key, module)):
+                        self._executed[key] = module
+                        del sys.modules[key]
+                sys.modules.update({key: module for key, module in before.items() if key not in sys.modules})
+
+    def _is_own(self, key: str, module: ModuleType) -> bool:
+        """Return whether a module is a file of the folder ``base``, or part of a package in it."""
+        places = [file] if (file := getattr(module, "__file__", None)) else list(getattr(module, "__path__", []))
+        if self._base is None or not places:
+            return False
+        # Other folders within ``base`` do not count, because one may contain installed packages.
+        place = Path(places[0])
+        return place.parent == self._base or place.is_relative_to(self._base / _root(key))
+
+
+def _root(name: str) -> str:
+    """Return the outermost package of a module."""
+    return name.partition(".")[0]
+
+
+def _execute(name: str, path: Path) -> None:
+    """Execute the file of a module or a package, and add the module to `sys.modules`."""
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} is not a module")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        sys.modules.pop(name, None)
+        raise
 
 
 @contextmanager
