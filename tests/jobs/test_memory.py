@@ -15,7 +15,7 @@ import safetensors.numpy
 
 from pathreplay import PathreplayError
 from pathreplay.inverse.config.optimizer_options import Optimizer
-from pathreplay.inverse.images.disk_store import DiskStore
+from pathreplay.inverse.images.disk_store import SMALL, DiskStore
 from pathreplay.inverse.objective.evaluate import Evaluation, Local, Shard, total
 from pathreplay.inverse.optim import adaptive as optimisers
 from pathreplay.inverse.optim.adaptive import DrJitOptimiser, WhenAsked
@@ -119,6 +119,41 @@ def test_an_album_keeps_what_it_is_given(tmp_path: Path, monkeypatch: pytest.Mon
         np.testing.assert_array_equal(picture, other)
         assert other.dtype == np.float32 and other.shape == picture.shape
     assert not list(tmp_path.glob("pathreplay-*")), "the file has no name"
+
+
+def test_an_album_uses_the_space_of_freed_arrays_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of one problem share a store, and the images of an earlier run are freed."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    store, sizes = DiskStore(room=2**20), []
+    for _ in range(3):
+        pictures = [array(300, 200, 3) for _ in range(4)]
+        kept = [store.keep(picture) for picture in pictures]
+        assert [one is other for one, other in zip(kept, pictures, strict=True)] == [True, False, False, False]
+        part = kept[2][10:20]  # a part keeps its map
+        del kept[1:3]
+        again = store.keep(pictures[1])
+        np.testing.assert_array_equal(again, pictures[1])
+        np.testing.assert_array_equal(part, pictures[2][10:20])
+        np.testing.assert_array_equal(kept[1], pictures[3])
+        assert store._file is not None and len(store._maps) == 3
+        sizes.append(os.fstat(store._file.fileno()).st_size)
+        del kept, again, part, pictures
+    assert store.room == 2**20 and not store._maps
+    assert len(set(sizes)) == 1 and sizes[0] < 3.1 * 300 * 200 * 3 * 4
+
+
+def test_an_album_keeps_arrays_of_all_sizes_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    store, random = DiskStore(room=0), np.random.default_rng(3)
+    held: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    most = 0
+    for n in range(200):
+        picture = array(int(random.integers(SMALL // 4 + 1, 2**17)))
+        held[n % int(random.integers(1, 9))] = picture, store.keep(picture)
+        most = max(most, sum(len(picture) for picture, _ in held.values()) * 4)
+        for picture, kept in held.values():
+            np.testing.assert_array_equal(kept, picture)
+    assert store._file is not None and os.fstat(store._file.fileno()).st_size < 3 * most
 
 
 def test_an_album_tells_of_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:

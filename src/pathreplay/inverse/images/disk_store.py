@@ -10,6 +10,7 @@ import mmap
 import os
 import tempfile
 import weakref
+from collections import deque
 from pathlib import Path
 from typing import IO
 
@@ -27,13 +28,20 @@ Array = NDArray[np.float32]
 
 
 class DiskStore:
-    """Keeps up to ``room`` bytes of arrays in memory, and other arrays in a file in TMPDIR (default: /var/tmp)."""
+    """Keeps up to ``room`` bytes of arrays in memory, and other arrays in a file in TMPDIR (default: /var/tmp).
+
+    Arrays that nobody uses any more give their memory budget and their part of the file back.
+    """
 
     def __init__(self, room: int = ROOM) -> None:
-        self.room = room
+        self._room = room
         self._file: IO[bytes] | None = None
         self._end = 0
-        self._maps: list[mmap.mmap] = []
+        self._gaps: list[tuple[int, int]] = []  # begin and end of the unused parts of the file, in order
+        self._maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+        # The garbage collector may free an array at any time. Freed space is therefore only noted, in these queues.
+        self._freed: deque[int] = deque()
+        self._unmapped: deque[tuple[int, int]] = deque()
 
     @staticmethod
     def of(budget: int | None) -> DiskStore:
@@ -46,9 +54,11 @@ class DiskStore:
         Raises PathreplayError if the disk is full.
         """
         if array.nbytes <= SMALL or array.nbytes <= self.room:
-            self.room -= array.nbytes
+            self._room -= array.nbytes
+            weakref.finalize(array, self._freed.append, array.nbytes).atexit = False
             return array
-        begin = self._end
+        # Memory maps must begin at a page boundary.
+        begin, end = self._allocate(-(-array.nbytes // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY)
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(dir=_folder(), prefix="pathreplay-")
@@ -57,17 +67,45 @@ class DiskStore:
             np.ascontiguousarray(array).tofile(self._file)
             self._file.flush()
         except OSError as error:
+            self._unmapped.append((begin, end))
             if error.errno not in (errno.ENOSPC, errno.EDQUOT, None):
                 raise
             raise PathreplayError(
                 f"No space left in {_folder()} for {(begin + array.nbytes) / 1e9:.2g} GB of images and initial values "
                 "that are kept on disk; free some space, or set TMPDIR to a folder on another disk"
             ) from error
-        # Memory maps must begin at a page boundary.
-        self._end = -(-(begin + array.nbytes) // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
         pages = mmap.mmap(self._file.fileno(), array.nbytes, access=mmap.ACCESS_READ, offset=begin)
-        self._maps.append(pages)
+        self._maps.add(pages)
+        # The map lives as long as any array that shows a part of it.
+        weakref.finalize(pages, self._unmapped.append, (begin, end)).atexit = False
         return np.frombuffer(pages, array.dtype).reshape(array.shape)
+
+    @property
+    def room(self) -> int:
+        """Bytes of memory that are left for arrays."""
+        while self._freed:
+            self._room += self._freed.popleft()
+        return self._room
+
+    def _allocate(self, size: int) -> tuple[int, int]:
+        """Return begin and end of an unused part of the file: the first that is large enough, or a new one."""
+        while self._unmapped:
+            self._gaps.append(self._unmapped.popleft())
+        joined: list[tuple[int, int]] = []
+        for begin, end in sorted(self._gaps):
+            if joined and joined[-1][1] == begin:
+                joined[-1] = joined[-1][0], end
+            else:
+                joined.append((begin, end))
+        if joined and joined[-1][1] == self._end:
+            self._end = joined.pop()[0]
+        self._gaps = joined
+        for k, (begin, end) in enumerate(joined):
+            if end - begin >= size:
+                joined[k : k + 1] = [(begin + size, end)] if begin + size < end else []
+                return begin, begin + size
+        self._end += size
+        return self._end - size, self._end
 
     def rest(self) -> None:
         """Release the memory of the mapped pages, which are read from disk again on the next access."""
