@@ -71,6 +71,13 @@ def test_crop_keeps_the_middle_and_the_aspect() -> None:
     assert images.resized(image, 2, 2, crop=True).shape == (2, 2, 1)
 
 
+@pytest.mark.parametrize(("height", "width"), [(2, 512), (512, 2)])
+def test_a_crop_to_a_strip_keeps_at_least_one_pixel(height: int, width: int) -> None:
+    image = np.linspace(0, 1, 40 * 64, dtype=np.float32).reshape(40, 64, 1)
+    strip = images.resized(image, height, width, crop=True)
+    assert strip.shape == (height, width, 1) and 0.4 < strip.mean() < 0.6
+
+
 def test_channels_are_adapted_or_refused() -> None:
     colour = np.full((1, 1, 3), 0.5, np.float32)
     assert images.with_channels(colour, 1) == pytest.approx(0.5)

@@ -221,7 +221,7 @@ def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Ima
     """
     if crop:
         h, w = image.shape[:2]
-        keep_h, keep_w = min(h, round(w * height / width)), min(w, round(h * width / height))
+        keep_h, keep_w = min(h, max(1, round(w * height / width))), min(w, max(1, round(h * width / height)))
         top, left = (h - keep_h) // 2, (w - keep_w) // 2
         image = image[top : top + keep_h, left : left + keep_w]
     if image.shape[:2] == (height, width):
