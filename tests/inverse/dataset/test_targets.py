@@ -109,6 +109,14 @@ def test_patterns_name_files_in_the_order_in_which_people_count(folder: Path) ->
     assert list(matching(["[1].png"], folder)) == ["[1].png"]  # a file of that very name
 
 
+def test_patterns_leave_hidden_files_out(folder: Path) -> None:
+    """macOS writes ._a.png beside a.png on disks of other systems."""
+    for name in ("shot2.png", "._shot2.png", ".shot3.png"):
+        (folder / name).touch()
+    assert list(matching(["*shot*.png"], folder)) == ["shot2.png"]
+    assert list(matching([".*.png"], folder)) == ["._shot2.png", ".shot3.png"]
+
+
 def test_a_pattern_gives_a_picture_to_each_view(folder: Path) -> None:
     (folder / "photos").mkdir()
     two = scene().replace("<sensor", '<sensor type="perspective" id="left"><film type="hdrfilm"><integer name="width" '

@@ -18,6 +18,8 @@ MOST_FILES = 100_000
 def matching(names: Iterable[str], base: Path) -> Iterator[str]:
     """Yield file names. A name with wildcards in its last part (photos/*.png) yields matching files in natural order.
 
+    Hidden files, whose names begin with a dot, match only patterns that begin with a dot.
+
     Raises PathreplayError if no file matches a pattern, or if the name of a folder has wildcards.
     """
     for name in names:
@@ -45,6 +47,9 @@ def _expanded(name: str, base: Path) -> list[str]:
                         f"Pattern {shown(name)}: its folder has more than {MOST_FILES} files; move the images to a "
                         "separate folder"
                     )
+                # As in a shell, hidden files (such as ._a.png, which macOS adds) match only patterns of hidden files.
+                if entry.name.startswith(".") and not pattern.startswith("."):
+                    continue
                 if fnmatch.fnmatchcase(entry.name, pattern):
                     names.append(entry.name)
     except (OSError, ValueError) as error:
