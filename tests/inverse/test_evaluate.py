@@ -158,6 +158,18 @@ def test_views_are_not_recorded_where_there_are_too_many(monkeypatch: pytest.Mon
         assert Evaluator(problem, problem.integrator).freezes == records
 
 
+def test_a_loss_of_the_users_own_may_hold_arrays_of_numpy(room: Path) -> None:  # noqa: F811
+    """Its passes are not recorded: to copy such an array into a recording would end the process."""
+    loss = "(i - t) ** 2 * mi.TensorXf(np.float32([[[0.2, 0.7, 0.1]]]))"
+    (room / "own.py").write_text(f"import numpy as np, mitsuba as mi\ndef f(i, t): return {loss}")
+    config = make_config({**JOB, **SWEEP, **BOX, "loss": "own:f"})
+    problem = build_problem(config, Path.cwd())
+    run = new_run(problem, problem.integrator)
+    for i in range(3):
+        take_step(problem, run, i)
+    assert run.history[2].loss > 0
+
+
 def test_observers_hear_of_everything_in_order() -> None:
     grid = [{"key": TEXTURE, "initial": 0.5, "resolutions": [2, 4], "refine_at": [2]}]
     config = make_config({**JOB, "iterations": 3, "parameters": grid})

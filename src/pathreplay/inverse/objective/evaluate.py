@@ -19,7 +19,7 @@ from pathreplay.integrators.film.image import make_ready
 from pathreplay.integrators.lifetimes import plain_errors
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import stateful
-from pathreplay.inverse.losses.pixelwise import ELSEWHERE
+from pathreplay.inverse.losses.pixelwise import ELSEWHERE, Own
 from pathreplay.inverse.objective.frozen import (
     NotRecordable,
     Recordings,
@@ -218,7 +218,9 @@ class Evaluator:
         # Deterministic jobs do not record passes: recording splits kernels differently, and thus changes the last bit
         # of results.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
-        self.freezes = known and record and is_recordable(self.integrator, has_media) and problem.loss not in ELSEWHERE
+        # A user's loss may contain NumPy arrays. To copy one during a recording ends the process.
+        loss = problem.loss not in ELSEWHERE and not isinstance(problem.loss, Own)
+        self.freezes = known and record and loss and is_recordable(self.integrator, has_media)
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # Keys: samples per pixel.
         # Whether one pass computes image and gradient. Keys: view, samples per pixel, and whether pixels are batched.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
