@@ -99,6 +99,17 @@ def test_at_the_target_and_in_the_dark_gradients_are_numbers(name: str) -> None:
     assert np.isfinite(value_and_gradient(name, target, np.zeros_like(target), None)[1]).all()
 
 
+@pytest.mark.parametrize("name", ["log", "ssim"])
+def test_black_pixels_have_a_gradient(name: str) -> None:
+    """Otherwise, a light whose intensity is zero would keep it."""
+    _, target = pictures((6, 6, 3))
+    black = np.zeros_like(target)
+    value, gradient = value_and_gradient(name, black, target, None)
+    brighter = value_and_gradient(name, black + 1e-4, target, None)[0]
+    assert gradient.sum() == pytest.approx((brighter - value) / 1e-4, rel=0.05)
+    assert gradient.sum() < 0
+
+
 def test_a_factor_does_not_count() -> None:
     image, target = pictures((6, 6, 3))
     values = [value_and_gradient("scale-invariant", k * image, target, None)[0] for k in (0.1, 1.0, 10.0)]

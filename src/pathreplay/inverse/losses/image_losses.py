@@ -55,7 +55,8 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 def _encoded(image: mi.TensorXf) -> mi.TensorXf:
     """Apply the sRGB transfer function. Values above 1 are not clipped, but use the same formula."""
     bright = dr.maximum(image, 0.0031308)  # the unselected branch must have a finite derivative, too
-    return dr.select(image > 0.0031308, 1.055 * dr.power(bright, 1 / 2.4) - 0.055, 12.92 * dr.maximum(image, 0))
+    dark = dr.select(image < 0, 0, 12.92 * image)  # unlike `dr.maximum`, with a derivative at exactly 0
+    return dr.select(image > 0.0031308, 1.055 * dr.power(bright, 1 / 2.4) - 0.055, dark)
 
 
 def _blurred(image: mi.TensorXf) -> mi.TensorXf:

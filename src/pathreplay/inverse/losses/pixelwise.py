@@ -63,7 +63,7 @@ def log(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
     Noise in I biases the gradient.
     """
-    positive = dr.maximum(image, 0)
+    positive = dr.select(image < 0, 0, image)  # unlike the derivative of `dr.maximum`, its derivative at 0 is 1
     return dr.square(dr.log(1 + positive) - dr.log(1 + dr.maximum(target, 0)))
 
 
