@@ -12,11 +12,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import scipy.ndimage
 
 from formulas import FORMULAS
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import encoded
-from pathreplay.inverse.images.metrics import _similarity
+from pathreplay.inverse.images.metrics import C1, C2, CUT, SIGMA, _similarity
 from pathreplay.inverse.losses import image_losses as losses
 from pathreplay.inverse.losses.pixelwise import LOSSES, find_loss, mean_loss
 from pathreplay.jobs import make_config, optimize
@@ -108,6 +109,40 @@ def test_black_pixels_have_a_gradient(name: str) -> None:
     brighter = value_and_gradient(name, black + 1e-4, target, None)[0]
     assert gradient.sum() == pytest.approx((brighter - value) / 1e-4, rel=0.05)
     assert gradient.sum() < 0
+
+
+def test_even_regions_of_high_radiance_are_compared_in_double_precision() -> None:
+    """A variance is a difference of squares, which single precision rounds to more than the constants of SSIM."""
+    _, target = pictures((24, 24, 3))
+    target[4:, 4:] = 1e4
+    image = np.where(target == 1e4, 1.001e4, 1.05 * target)
+    image, target = (x.astype(np.float32).astype(np.float64) for x in (image, target))
+    value, gradient = value_and_gradient("ssim", image, target, None)
+
+    def at(scale: float) -> float:
+        return exact_ssim(np.where(target == 1e4, scale * image, image), target)
+
+    assert value == pytest.approx(at(1), rel=1e-3)
+    along = np.where(target == 1e4, image, 0)
+    assert np.vdot(gradient, along) == pytest.approx((at(1 + 1e-4) - at(1 - 1e-4)) / 2e-4, rel=1e-2)
+
+
+def exact_ssim(image: np.ndarray, target: np.ndarray) -> float:
+    """In double precision, unlike the SSIM of reports, with colours that are not clipped."""
+
+    def blurred(x: np.ndarray) -> np.ndarray:
+        window = np.exp(-0.5 * (np.arange(-CUT, CUT + 1) / SIGMA) ** 2)
+        for axis in (0, 1):
+            x = scipy.ndimage.correlate1d(x, window / window.sum(), axis=axis, mode="reflect")
+        return x
+
+    a, b = (
+        np.where(x > 0.0031308, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055, 12.92 * x)
+        for x in (image, target)
+    )
+    m, n = blurred(a), blurred(b)
+    s, t, c = blurred(a * a) - m * m, blurred(b * b) - n * n, blurred(a * b) - m * n
+    return float(np.mean(1 - (2 * m * n + C1) * (2 * c + C2) / ((m * m + n * n + C1) * (s + t + C2))))
 
 
 def test_a_factor_does_not_count() -> None:

@@ -46,10 +46,12 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
     Window and constants follow Wang et al. 2004. The SSIM in reports (`Likeness`) uses the same window and constants.
     """
-    a, b = _encoded(image), _encoded(target)
+    # In double precision: the variance of a bright, even region is a small difference of large squares.
+    double = dr.float64_array_t(mi.TensorXf)
+    a, b = double(_encoded(image)), double(_encoded(target))
     μ, ν = _blurred(a), _blurred(b)
     σ, τ, covariance = _blurred(a * a) - μ * μ, _blurred(b * b) - ν * ν, _blurred(a * b) - μ * ν
-    return 1 - (2 * μ * ν + C1) * (2 * covariance + C2) / ((μ * μ + ν * ν + C1) * (σ + τ + C2))
+    return mi.TensorXf(1 - (2 * μ * ν + C1) * (2 * covariance + C2) / ((μ * μ + ν * ν + C1) * (σ + τ + C2)))
 
 
 def _encoded(image: mi.TensorXf) -> mi.TensorXf:
@@ -60,7 +62,7 @@ def _encoded(image: mi.TensorXf) -> mi.TensorXf:
 
 
 def _blurred(image: mi.TensorXf) -> mi.TensorXf:
-    """Convolve an image with the Gaussian window of SSIM. The image is mirrored at its borders."""
+    """Convolve an image with the Gaussian window of SSIM, in the image's precision. Its borders are mirrored."""
     offsets = np.arange(-CUT, CUT + 1)
     window = np.exp(-0.5 * (offsets / SIGMA) ** 2)
     window /= window.sum()
@@ -69,13 +71,13 @@ def _blurred(image: mi.TensorXf) -> mi.TensorXf:
         at = dr.arange(mi.UInt32, int(np.prod(image.shape)))
         position = at // stride % n
         values = image.array
-        mean = mi.Float(0)
+        mean = type(values)(0)
         for offset, w in zip(offsets, window, strict=True):
             # Mirroring repeats the n pixels with period 2 n: first in their order, then in reverse order.
             tap = (position + int(offset % (2 * n))) % (2 * n)
             tap = dr.select(tap < n, tap, 2 * n - 1 - tap)
-            mean += dr.gather(mi.Float, values, at + (tap - position) * stride) * float(w)
-        image = mi.TensorXf(mean, image.shape)
+            mean += dr.gather(type(values), values, at + (tap - position) * stride) * float(w)
+        image = type(image)(mean, image.shape)
     return image
 
 
