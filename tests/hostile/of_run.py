@@ -183,6 +183,22 @@ def _metadata(name: str, value: str, *, refused: bool = True) -> None:
     _run(f"checkpoint: {name} = {value[:60]}", change, refused=refused)
 
 
+def _replaced(name: str, value: str, *, refused: bool = True) -> None:
+    """The text in a tensor of bytes: another, of any length."""
+
+    def change(run: Path, room: Room, rng: np.random.Generator) -> None:
+        head, body = _parts(run / "checkpoint.safetensors")
+        text = value.encode()
+        begin, end = head[name]["data_offsets"]
+        for tensor in head.values():
+            if tensor.get("data_offsets", [0])[0] >= end:
+                tensor["data_offsets"] = [at - end + begin + len(text) for at in tensor["data_offsets"]]
+        head[name] |= {"shape": [len(text)], "data_offsets": [begin, begin + len(text)]}
+        _put(run / "checkpoint.safetensors", head, body[:begin] + text + body[end:])
+
+    _run(f"checkpoint: {name} = {value[:60]}", change, refused=refused)
+
+
 KEY = "paint.reflectance.data"
 ENTRY = {"iteration": 0, "loss": 0.1, "seconds": 0.1, "gradient_norms": {KEY: 0.1}, "dropped": 0, "errors": {}}
 for _steps in ("[]", "{}", "null", "x", json.dumps({KEY: -5}), json.dumps({KEY: "two"}), json.dumps({KEY: 1e30}),
@@ -203,8 +219,8 @@ for _history in (
     json.dumps([{**ENTRY, "errors": {KEY: "x"}}]),
     json.dumps([{**ENTRY, "seconds": -1e300}]),
 ):
-    _metadata("history", _history)
-_metadata("history", json.dumps([{**ENTRY, "iteration": i} for i in range(100)]))
+    _replaced("history", _history)
+_replaced("history", json.dumps([{**ENTRY, "iteration": i} for i in range(100)]))
 
 
 @recipe(KIND, refused=True, fuzz=True)

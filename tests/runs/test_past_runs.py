@@ -41,8 +41,8 @@ def a_run(folder: Path, losses: tuple[float, ...] = (1.0, 0.5, 0.25), **changes:
     (folder / "config.json").write_text(make_config({**JOB, **changes}).model_dump_json(exclude_unset=True))
     (folder / "run.json").write_text(json.dumps({"base": str(folder), "config": None}))
     history = [Entry(i, loss, 0.5, {TEXTURE: loss}, errors={TEXTURE: 2 * loss}) for i, loss in enumerate(losses)]
-    metadata = {"history": _HISTORY.dump_json(history).decode()}
-    (folder / "checkpoint.safetensors").write_bytes(safetensors.numpy.save({"x": np.zeros(1, np.float32)}, metadata))
+    tensors = {"history": np.frombuffer(_HISTORY.dump_json(history), np.uint8)}
+    (folder / "checkpoint.safetensors").write_bytes(safetensors.numpy.save(tensors))
     result = {"rmse": 0.1, "psnr": 20 + losses[-1], "ssim": 0.9}
     views = {name: {"is_test": name == "right", "exposure": 1.0, "result": result} for name in ("left", "right")}
     (folder / "views.json").write_text(json.dumps(views))
@@ -113,6 +113,12 @@ DAMAGE = {
         "cannot be read",
     ),
     "a history that is none": (
+        lambda run: (run / "checkpoint.safetensors").write_bytes(
+            safetensors.numpy.save({"history": np.frombuffer(b"[{}]", np.uint8)})
+        ),
+        "its history is damaged",
+    ),
+    "a history of an older version that is none": (
         lambda run: (run / "checkpoint.safetensors").write_bytes(
             safetensors.numpy.save({"x": np.zeros(1, np.float32)}, {"history": "[{}]"})
         ),

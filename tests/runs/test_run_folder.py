@@ -10,6 +10,7 @@ import os
 import random
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from pathreplay.inverse.loop.loop import new_run
 from pathreplay.inverse.problem.problem import build_problem
 from pathreplay.jobs import RunResult, optimize
 from pathreplay.report.progress import Progress
+from pathreplay.report.watch.past import pasts
 from pathreplay.runs import run_folder
 from pathreplay.runs.folder_lock import LOCK, FolderLock
 from room_job import TEXTURE
@@ -246,13 +248,16 @@ def test_impossible_resume_gets_one_line(name: str, room: Path) -> None:
 
 
 def tensors(run: Path, change: Callable[[dict[str, np.ndarray], dict[str, Any]], Any]) -> None:
-    """Change the tensors and the metadata of the checkpoint."""
+    """Change the tensors of the checkpoint, and its JSON texts: the metadata and the history."""
     path = run / CHECKPOINT
     with safetensors.safe_open(str(path), framework="numpy") as file:
         metadata = {key: json.loads(value) for key, value in file.metadata().items()}
         arrays = {name: file.get_tensor(name).copy() for name in file.keys()}
     arrays.pop(SEAL)
+    metadata["history"] = json.loads(arrays.pop("history").tobytes())
     change(arrays, metadata)
+    if "history" in metadata:
+        arrays["history"] = np.frombuffer(json.dumps(metadata.pop("history")).encode(), np.uint8)
     text = {key: json.dumps(value) for key, value in metadata.items()}
     path.write_bytes(b"".join(sealed_chunks(arrays, text)))
 
@@ -341,6 +346,24 @@ def test_damage_gets_one_line(case: str, finished: Path, tmp_path: Path) -> None
     if case.endswith("of another size"):
         assert f"{case.split()[0]}-left.exr has shape" in line
     assert before == {path: path.read_bytes() for path in before}
+
+
+def test_the_history_is_in_no_header_but_older_checkpoints_are_read(finished: Path, tmp_path: Path) -> None:
+    """Readers take headers of at most 100 MB, which a long run would exceed."""
+    shutil.copytree(finished, tmp_path / "copy")
+    run = longer(tmp_path / "copy")
+    (run / "run.json").write_text(json.dumps({"base": str(tmp_path / "copy"), "config": None}))
+    path = run / CHECKPOINT
+    with safetensors.safe_open(str(path), framework="numpy") as file:
+        metadata, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
+    assert metadata.keys() == {"steps"}
+    history = arrays.pop("history").tobytes().decode()
+    arrays.pop(SEAL)
+    path.write_bytes(b"".join(sealed_chunks(arrays, {**metadata, "history": history})))
+    (past,) = pasts([run])
+    assert [asdict(entry) for entry in past.history] == json.loads(history)
+    result = optimize(resume=run, progress=False)
+    assert [asdict(entry) for entry in result.history[: len(past.history)]] == json.loads(history)
 
 
 def flipped(data: bytes, bit: int) -> bytes:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from pathreplay.inverse.loop.checkpoint import HISTORY
 from pathreplay.inverse.loop.checksums import SEAL
 from pathreplay.jobs import make_config
 from pathreplay.platform import interrupts
@@ -77,10 +78,10 @@ def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 def checkpoint_bits(folder: Path) -> dict[str, bytes]:
     """What the checkpoint in a run folder holds, bit for bit: values, what the optimiser remembers, what was learned.
 
-    Without its seal, which knows how many seconds the run took.
+    Without its history and its seal, which know how many seconds the run took.
     """
     tensors = safetensors.numpy.load_file(folder / "checkpoint.safetensors")
-    return {name: value.tobytes() for name, value in tensors.items() if name != SEAL}
+    return {name: value.tobytes() for name, value in tensors.items() if name not in (HISTORY, SEAL)}
 
 
 def kill_at_checkpoint(folder: Path, process: subprocess.Popen[str], which: int, number: signal.Signals) -> None:

@@ -84,6 +84,9 @@ _HISTORY = TypeAdapter(list[Entry])
 _STEPS = TypeAdapter(dict[str, NonNegativeInt])
 
 _VALUE, _LEARNED = "value:", "learned:"
+HISTORY = "history"
+"""Name of the tensor with the history: the bytes of a JSON text. Headers of safetensors files have a limit of 100 MB,
+which the history of a long run with many variables exceeds."""
 
 
 def save(run: Run) -> Content:
@@ -93,9 +96,30 @@ def save(run: Run) -> Content:
         **{_LEARNED + name: value for name, value in run.learned.items()},
         **{_VALUE + key: value for key, value in run.values.items()},
     }
-    metadata = {"steps": json.dumps(state.steps), "history": json.dumps([asdict(entry) for entry in run.history])}
+    plain[HISTORY] = _bytes_of(json.dumps([asdict(entry) for entry in run.history]))
+    metadata = {"steps": json.dumps(state.steps)}
     arrays = {name: partial(group.__getitem__, name) for group in (plain, state.arrays) for name in group}
     return partial(sealed_chunks, WhenAsked(arrays), metadata)
+
+
+def _bytes_of(text: str) -> np.ndarray:
+    """Encode a JSON text. Spaces at its end align the next tensor to eight bytes."""
+    data = text.encode()
+    return np.frombuffer(data + b" " * (-len(data) % 8), np.uint8)
+
+
+def history_of(metadata: Mapping[str, str] | None, tensor: np.ndarray | None) -> list[Entry]:
+    """Decode the history in a checkpoint.
+
+    Args:
+        metadata: text fields of the checkpoint's header. Files of older versions have the history there.
+        tensor: the tensor `HISTORY`; None if the checkpoint has none.
+
+    Raises:
+        ValidationError: the history is missing or damaged.
+    """
+    text = (metadata or {}).get(HISTORY, "") if tensor is None else tensor.tobytes()
+    return _HISTORY.validate_json(text, strict=True)
 
 
 def restore(path: Path, run: Run, variables: Sequence[Variable], held: Collection[str] = ()) -> None:
@@ -135,7 +159,7 @@ def _read(
         metadata = file.metadata() or {}
         tensors = {name: file.get_tensor(name) for name in file.keys() if name != SEAL}
     steps = _STEPS.validate_json(metadata.get("steps", ""), strict=True)
-    history = _HISTORY.validate_json(metadata.get("history", ""), strict=True)
+    history = history_of(metadata, tensors.pop(HISTORY, None))
     if set(steps) != set(values):
         raise PathreplayError(
             f"Checkpoint {path} has the parameters {', '.join(steps)}, but the config names {', '.join(values)}; "

@@ -8,16 +8,14 @@ from functools import cached_property
 from pathlib import Path
 
 import safetensors
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.schema import Config
-from pathreplay.inverse.loop.checkpoint import Entry
+from pathreplay.inverse.loop.checkpoint import HISTORY, Entry, history_of
 from pathreplay.report.watch.run_files import read_own
 from pathreplay.runs.run_folder import CHECKPOINT, read_job
 from pathreplay.types import Json
-
-_HISTORY = TypeAdapter(list[Entry])
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,8 @@ class Past:
         path = self.folder / CHECKPOINT
         try:
             with safetensors.safe_open(str(path), framework="numpy") as file:
-                return _HISTORY.validate_json((file.metadata() or {}).get("history", ""), strict=True)
+                tensor = file.get_tensor(HISTORY) if HISTORY in file.keys() else None
+                return history_of(file.metadata(), tensor)
         except (OSError, safetensors.SafetensorError, ValidationError) as error:
             why = "its history is damaged" if isinstance(error, ValidationError) else str(error)
             raise PathreplayError(
