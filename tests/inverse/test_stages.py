@@ -5,20 +5,27 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
+import pathreplay
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.views import View
+from pathreplay.inverse.loop import loop
+from pathreplay.inverse.loop.events import Stepped
 from pathreplay.inverse.objective.evaluate import Evaluator, Shard
 from pathreplay.inverse.objective.stages import Staged, part_at, scaled
 from pathreplay.inverse.problem.problem import build_problem
 from pathreplay.jobs import iterate, make_config, optimize
+from pathreplay.library.iterations import run_of
+from pathreplay.platform.interrupts import Stop
 from pathreplay.platform.threads import one_thread
 from pathreplay.scenes.parameters import get_array
 from room_job import CLOUD, JOB, SCENE, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 from small_job import checkpoint_bits
 
+FILM = {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgb", "rfilter": {"type": "box"}}
 FLOOR = "floor.reflectance.value"
 STAGES = [
     {"iterations": 2, "downscale": 2, "spp": 8, "max_depth": 2, "parameters": ["floor.*"]},
@@ -99,6 +106,31 @@ def test_a_job_goes_through_its_stages() -> None:
     assert first[first > 1e-4] == pytest.approx(0.5 * 0.1 * 0.1 ** (2 / 7), rel=1e-3)
     assert session.result is not None and session.result.iterations == 7
     assert [entry.spp for entry in session.result.history] == [8, 8, 4, 4, 4, 4, 4]
+
+
+@pytest.mark.parametrize("stops", [True, False])
+def test_films_are_whole_again_after_a_run_that_ends_in_a_smaller_stage(stops: bool) -> None:
+    config = staged(stages=[{"iterations": 2, "downscale": 2}])
+    problem = build_problem(config, Path.cwd())
+    run = run_of(problem, None)
+    for event in loop.iterate(problem, run, Stop()):
+        if stops and isinstance(event, Stepped):
+            break
+    del event
+    assert [tuple(sensor.film().size()) for sensor in problem.scene.sensors()] == [(12, 10)] * 2
+
+
+def test_films_are_whole_again_after_a_step_in_a_smaller_stage() -> None:
+    scene = mi.load_dict(mi.cornell_box() | {"sensor": mi.cornell_box()["sensor"] | {"film": FILM}})
+    view = pathreplay.View(target=np.ones((8, 8, 3), np.float32))
+    problem = pathreplay.Problem(scene, {"red.reflectance.value": pathreplay.Parameter(initial=0.5)}, view)
+    state = pathreplay.init(problem, steps=6, stages=[{"iterations": 6, "downscale": 2}], spp=1)
+    for _ in range(6):
+        state = pathreplay.step(problem, state)
+        assert tuple(scene.sensors()[0].film().size()) == (8, 8)
+    executor = next(iter(state._task._known.values()))[1]
+    (recordings,) = executor.evaluate._evaluate._recordings.values()  # type: ignore[attr-defined]
+    assert [each.n_recordings for each in recordings._frozen.values()] == [1]
 
 
 def test_stages_choose_views_and_batches() -> None:

@@ -12,7 +12,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.loop import best_values, new_run, optimiser_of, require_gradients, take_step
 from pathreplay.inverse.objective.evaluate import Executor, Local
-from pathreplay.inverse.objective.stages import evaluator_of
+from pathreplay.inverse.objective.stages import evaluator_of, restore_films
 from pathreplay.inverse.optim import adaptive
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import latents
@@ -146,8 +146,11 @@ def step(problem: Problem, state: State) -> State:
         )
     optimiser = task.optimiser_at(state, built)
     run = Run(executor, optimiser, dict(state._next), state._learned, list(state.history))
-    with built.computing():
-        take_step(built, run, min(len(state.history), built.config.iterations - 1))
+    try:
+        with built.computing():
+            take_step(built, run, min(len(state.history), built.config.iterations - 1))
+    finally:
+        restore_films(built)
     require_gradients(built, run)
     found = best_values(built, run)
     kept = _copied(optimiser.state())

@@ -44,7 +44,7 @@ from pathreplay.inverse.objective.evaluate import (
     release,
     total,
 )
-from pathreplay.inverse.objective.stages import Part, part_at
+from pathreplay.inverse.objective.stages import Part, part_at, restore_films
 from pathreplay.inverse.optim.adaptive import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optim.averaging import Averaged
 from pathreplay.inverse.optim.lbfgs import LineSearch, Search
@@ -127,7 +127,7 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
     A run may have a baseline: a second run, by another integrator, for comparison. After each step of the run, the
     baseline takes steps until it has used as much time as the run. On a machine whose load varies, this alternation
     gives both runs equal conditions. The steps of the baseline use the learning rate and the resolutions of the run's
-    current iteration.
+    current iteration. At the end, the films have the sizes of the targets.
 
     Args:
         problem: the problem.
@@ -142,30 +142,33 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
     yield Started(len(run.history), config.iterations)
     faint: set[str] = set()
     stage, stages = None, config.stages or []
-    for i in range(len(run.history), config.iterations):
-        if run.optimiser.finished:
-            yield Finished(run.optimiser.finished)
-            break
-        if stages and place(stages, i) != stage:
-            stage = place(stages, i)
-            yield Entered(stage + 1, len(stages))
-        yield from take_step(problem, run, i)
-        if baseline := run.baseline:
-            while baseline.seconds() < run.seconds():
-                take_step(problem, baseline, i)
-            # Measure the image errors after the first iteration, and after each tenth of all iterations.
-            if i == 0 or JUDGEMENTS * i // config.iterations < JUDGEMENTS * (i + 1) // config.iterations:
-                for measured in (run, baseline):
-                    error = image_error(problem, best_values(problem, measured), i)
-                    measured.history[-1] = replace(measured.history[-1], picture_error=error)
-        for key, ratio in noise.ratios(run.history).items():
-            if ratio < noise.FAINT and key not in faint:
-                faint.add(key)
-                yield LowSNR(key, ratio, i, run.history[-1].spp)
-        yield Stepped(run.history[-1])
-        require_gradients(problem, run)
-        if stop.by is not None:
-            break
+    try:
+        for i in range(len(run.history), config.iterations):
+            if run.optimiser.finished:
+                yield Finished(run.optimiser.finished)
+                break
+            if stages and place(stages, i) != stage:
+                stage = place(stages, i)
+                yield Entered(stage + 1, len(stages))
+            yield from take_step(problem, run, i)
+            if baseline := run.baseline:
+                while baseline.seconds() < run.seconds():
+                    take_step(problem, baseline, i)
+                # Measure the image errors after the first iteration, and after each tenth of all iterations.
+                if i == 0 or JUDGEMENTS * i // config.iterations < JUDGEMENTS * (i + 1) // config.iterations:
+                    for measured in (run, baseline):
+                        error = image_error(problem, best_values(problem, measured), i)
+                        measured.history[-1] = replace(measured.history[-1], picture_error=error)
+            for key, ratio in noise.ratios(run.history).items():
+                if ratio < noise.FAINT and key not in faint:
+                    faint.add(key)
+                    yield LowSNR(key, ratio, i, run.history[-1].spp)
+            yield Stepped(run.history[-1])
+            require_gradients(problem, run)
+            if stop.by is not None:
+                break
+    finally:
+        restore_films(problem)
     yield Stopped(len(run.history))
 
 

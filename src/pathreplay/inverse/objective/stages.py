@@ -19,7 +19,7 @@ from pathreplay.inverse.objective.joint import JointEvaluator
 from pathreplay.inverse.objective.pixel_batches import obstacle, refused
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.inverse.problem.joint import JointProblem
-from pathreplay.inverse.problem.problem import Problem
+from pathreplay.inverse.problem.problem import Problem, sensor_of
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator
 
@@ -165,6 +165,13 @@ def _require_divisible(sensor: mi.Sensor, name: str, downscale: int) -> None:
 
 def _integrator(plugin: Plugin, max_depth: int) -> mi.Integrator:
     return load_integrator({**plugin.model_dump(), "max_depth": max_depth})
+
+
+def restore_films(problem: Problem) -> None:
+    """Resize the films of all views to their targets, if a stage may have downscaled the films."""
+    if any(stage.downscale > 1 for stage in problem.config.stages or []):
+        for view in problem.views:
+            sensor_of(problem, view)
 
 
 def scaled(view: View, downscale: int) -> View:
