@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import types
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import scipy.optimize
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.optimizer_options import Optimizer
+from pathreplay.inverse.config.parameter_options import TransformKind
+from pathreplay.inverse.loop.loop import optimiser_of
 from pathreplay.inverse.optim.adaptive import State
 from pathreplay.inverse.optim.lbfgs import MOST, LineSearch
+from pathreplay.inverse.optim.levenberg_marquardt import LevenbergMarquardt
+from pathreplay.inverse.parameters.gauss_newton import GaussNewton
+from pathreplay.inverse.parameters.reparameterization import Transform
+from pathreplay.inverse.parameters.variables import Variable, latent_bounds, latents
 from pathreplay.jobs import iterate, make_config, optimize
 from small_job import bits, checkpoint_bits
 from wall_job import JOB, SCENE
@@ -119,6 +127,50 @@ def test_many_parameters_are_refused() -> None:
         PathreplayError, match=f"{MOST + 1} entries, but optimizer type = 'l-bfgs-b' takes up to {MOST}"
     ):
         LineSearch(values, OPTIONS, {"a": (-1.0, 1.0)})
+
+
+@pytest.mark.parametrize("kind", ["l-bfgs-b", "levenberg-marquardt"])
+@pytest.mark.parametrize("transform", ["log", "softplus"])
+def test_an_active_bound_of_a_transformed_value_is_solved_for(transform: str, kind: str) -> None:
+    """Of two coupled values, where the best first one is beyond its bound: the second is best for the bound."""
+    one = np.float32([0.3])
+    first = Variable("a", mi.Float(0), (0.0, 1.0), 0.02, one, None, coordinates=Transform(transform, 0.0))  # type: ignore[arg-type]
+    second = Variable("b", mi.Float(0), (-np.inf, np.inf), 0.02, 0 * one, None)
+    values = {"a": one, "b": 0 * one}
+    problem = types.SimpleNamespace(variables=(first, second))
+    search = optimiser_of(problem, values, Optimizer(type=kind))  # type: ignore[arg-type]
+    matrix, best = np.array([[1.64, 1.6], [1.6, 1.64]]), np.array([2.0, 0.5])
+
+    def by_latent(gradient: np.ndarray) -> np.ndarray:
+        assert first.coordinates is not None
+        return first.coordinates.gradient(values["a"], np.float32(gradient))
+
+    for _ in range(25):
+        off = np.concatenate([values["a"], values["b"]]) - best
+        slope = matrix @ off
+        if isinstance(search, LevenbergMarquardt):
+            noise = 1e-9 * np.eye(2)
+            model = GaussNewton({"a": 1, "b": 1}, matrix, matrix, noise, noise, np.zeros(2), 0.0)
+            search.observe(model.mapped({"a": by_latent}))
+        gradients = {"a": by_latent(slope[:1]), "b": slope[1:]}
+        latent = search.step(latents(problem.variables, values), gradients, {"a": 0.02, "b": 0.02}, off @ slope / 2)
+        values = {"a": np.minimum(first.coordinates.values(latent["a"]), 1), "b": latent["b"]}  # type: ignore[union-attr]
+        if search.finished:
+            break
+    assert [*values["a"], *values["b"]] == pytest.approx([1, 0.5 + 1.6 / 1.64], abs=1e-4)
+
+
+def test_bounds_of_latents_are_those_that_the_transform_does_not_enforce() -> None:
+    def bounds(kind: TransformKind, lower: float, upper: float) -> list[float]:
+        transform = Transform(kind, lower, upper)
+        return list(latent_bounds(Variable("a", 0, (lower, upper), 1, np.ones(1), None, coordinates=transform)))  # type: ignore[arg-type]
+
+    free = [-np.inf, np.inf]
+    assert bounds("log", 0.0, np.inf) == bounds("log", -1.0, np.inf) == bounds("softplus", 0.5, np.inf) == free
+    assert bounds("logit", 0.0, 1.0) == free
+    assert bounds("log", 0.5, 2.0) == pytest.approx([np.log(0.5), np.log(2)])
+    assert bounds("softplus", 0.5, 2.0) == [-np.inf, pytest.approx(np.log(np.expm1(1.5)))]
+    assert bounds("softplus", -np.inf, 2.0) == [-np.inf, pytest.approx(np.log(np.expm1(2)))]
 
 
 # ------------------------------ In a job ------------------------------

@@ -52,7 +52,7 @@ from pathreplay.inverse.optim.levenberg_marquardt import LevenbergMarquardt
 from pathreplay.inverse.parameters.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.values import Array, Arrays
-from pathreplay.inverse.parameters.variables import latents
+from pathreplay.inverse.parameters.variables import latent_bounds, latents
 from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, sensor_of
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
@@ -98,8 +98,7 @@ def optimiser_of(problem: Problem, values: Arrays, options: Optimizer, search: S
     """Create the optimiser of the problem's variables at these values. For ``search`` see `LineSearch`."""
     values = latents(problem.variables, values)
     if options.searches:
-        free = -np.inf, np.inf  # `v.coordinates` already keep values within bounds
-        bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}
+        bounds = {v.key: latent_bounds(v) for v in problem.variables}
         if options.is_second_order and search is None:
             return LevenbergMarquardt(values, options, bounds)
         return LineSearch(values, options, bounds, search)

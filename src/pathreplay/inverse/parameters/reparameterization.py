@@ -62,6 +62,12 @@ class Transform:
                     f"needs values {what} {bound:g}; set another 'initial', or remove 'parameterization'"
                 )
 
+    def bounds(self, lower: float, upper: float) -> tuple[float, float]:
+        """Return the bounds of u for values in [lower, upper]; infinite where the transform itself ends."""
+        low = float(self.latent(np.array([lower], np.float32))[0]) if lower > self.lower else -np.inf
+        high = float(self.latent(np.array([upper], np.float32))[0]) if upper < self.upper else np.inf
+        return low, high
+
     def latent(self, values: Array) -> Array:
         """See `Coordinates`."""
         v = self._inside(values)

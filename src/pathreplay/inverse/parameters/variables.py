@@ -72,6 +72,15 @@ def latents(variables: Iterable[Variable], values: Mapping[str, Array]) -> dict[
     return {v.key: v.coordinates.latent(values[v.key]) if v.coordinates else values[v.key] for v in variables}
 
 
+def latent_bounds(variable: Variable) -> tuple[float, float]:
+    """Return the bounds of the latent array of a variable, as far as they are equivalent to bounds of its values."""
+    if variable.coordinates is None:
+        return variable.bounds
+    if isinstance(variable.coordinates, Transform):
+        return variable.coordinates.bounds(*variable.bounds)
+    return -np.inf, np.inf
+
+
 def keys_of(
     params: mi.SceneParameters,
     recovered: Sequence[Parameter],
