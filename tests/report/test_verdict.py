@@ -67,6 +67,18 @@ def test_values_at_a_bound_do_not_move() -> None:
     assert still_moves(history, "x") is False
 
 
+def test_large_values_that_move_in_small_steps_still_move() -> None:
+    """Their means differ in the seventh digit only."""
+    values = 2e5 - np.float32(2) ** -6 * np.arange(30)
+    history = [
+        SimpleNamespace(
+            slopes={"x": parts_of(np.float32([1 + 0.1 * (n % 2)]))}, means={"x": parts_of(np.float32([x]), True)}
+        )
+        for n, x in enumerate(values)
+    ]
+    assert still_moves(history, "x") is True
+
+
 def test_parts_are_sums_and_means_of_neighbours() -> None:
     assert parts_of(np.arange(16.0).reshape(2, 8)) == [1, 5, 9, 13, 17, 21, 25, 29]
     assert parts_of(np.arange(16.0), mean=True) == [0.5, 2.5, 4.5, 6.5, 8.5, 10.5, 12.5, 14.5]

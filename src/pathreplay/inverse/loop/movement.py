@@ -31,15 +31,17 @@ _FIRST = 5
 def parts_of(array: Array, mean: bool = False) -> list[float]:
     """Sum an array over up to `MOST_PARTS` contiguous parts, or average it over these parts if ``mean`` is set.
 
-    In a sum, independent noise of the entries averages out, and a common signal adds up. Results are rounded to six
-    digits to keep checkpoints small.
+    In a sum, independent noise of the entries averages out, and a common signal adds up. Sums are rounded to six digits
+    to keep checkpoints small. Means have nine digits, which tell all numbers in single precision apart: a large value
+    may move in steps of its last digit.
     """
     flat = np.ravel(array)
     if not flat.size:
         return []
     begins = np.linspace(0, flat.size, min(flat.size, MOST_PARTS) + 1).astype(np.int64)
+    digits = 9 if mean else 6
     sums = np.add.reduceat(flat, begins[:-1], dtype=np.float64)
-    return [float(f"{x:.6g}") for x in (sums / np.diff(begins) if mean else sums)]
+    return [float(f"{x:.{digits}g}") for x in (sums / np.diff(begins) if mean else sums)]
 
 
 def window_of(history: Sequence[Entry], begin: int = 0) -> Sequence[Entry]:
