@@ -24,8 +24,8 @@ def test_the_extrapolated_loss_of_noisy_images_has_a_small_bias(shares: tuple[fl
     images = [mi.TensorXf(rng.gamma(N * s, 1 / (N * s), (1000, 1000, 1)).astype(np.float32)) for s in shares]
     target = ViewTarget(mi.TensorXf(np.full((1000, 1000, 1), 0.8, np.float32)))
     gap = np.log(2) - np.log(1.8)
-    value, mean = _extrapolated(loss, target, images, list(shares))
-    plain = target.compared(loss, mean)
+    value, terms = _extrapolated(loss, target, images, list(shares))
+    plain = target.compared(loss, terms[0][1])
     assert plain[0] > 1.4 * gap**2
     assert abs(value[0] - gap**2) < 0.05 * (plain[0] - gap**2)
     dr.enable_grad(images)
@@ -72,6 +72,18 @@ def test_the_gradient_of_a_rendered_loss_loses_most_of_its_bias(target: np.ndarr
     assert noise < 0.02 and ours_noise < 0.02
     assert plain > 0.08
     assert ours < plain / 2
+
+
+def test_the_gradient_of_an_exposure_loses_most_of_its_bias(target: np.ndarray) -> None:
+    def by_exposure(spp: int, passes: int, **settings: object) -> tuple[float, float]:
+        f = pathreplay.value_and_grad(problem("log", spp, 13 * target, exposure={"fix_scale": False}, **settings))
+        found = [f({LIGHT: np.float32([150, 120, 60])}, seed=1 + n)[1]["exposure"].item() for n in range(passes)]
+        return float(np.mean(found)), float(np.std(found, ddof=1) / passes**0.5)
+
+    exact, noise = by_exposure(512, 4)
+    plain, ours = by_exposure(8, 100), by_exposure(8, 100, debias=True)
+    assert abs(plain[0] - exact) > 4 * max(noise, plain[1], ours[1])
+    assert abs(ours[0] - exact) < abs(plain[0] - exact) / 3
 
 
 def test_an_odd_number_of_samples_is_split(target: np.ndarray) -> None:

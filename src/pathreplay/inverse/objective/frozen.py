@@ -196,12 +196,13 @@ def _differentiate(
         wanted = _times(offset, factor), _times(_times(slope, factor), factor)
         image, state = integrator.pixel_pass(view, wanted, None if batch is None else batch.pixels, state)
         value = target.compared(loss.loss, image) * share
+        terms = [(1.0, image)]
     else:
         views = _halves(view) if loss.debias else [view]
         images = [integrator.image_pass(each, state) for each in views]
         if dr.grad_enabled(dict(params)):
             dr.enable_grad(images)
-        value, image = _extrapolated(loss.loss, target, images, [each.spp / view.spp for each in views])
+        value, terms = _extrapolated(loss.loss, target, images, [each.spp / view.spp for each in views])
         value *= share
         if dr.grad_enabled(value):
             dr.backward(value)
@@ -211,11 +212,12 @@ def _differentiate(
     if factor is not None and loss.by_factor:
         other = mi.sample_tea_32(mi.UInt32(view.seed), mi.UInt32(int(Stream.SECOND_IMAGE)))[0]
         again = integrator.image_pass(replace(view, seed=other), state)
-        by_factor = derivative(loss.loss, image, again, factor, target.target, target.weight) * share
+        slopes = [w * derivative(loss.loss, a, again, factor, target.target, target.weight) for w, a in terms]
+        by_factor = reduce(add, slopes) * share
     by_target = None
     if loss.by_target:
         offset, slope = linear_derivative(loss.loss, target.target, target.weight)
-        by_target = -share * (offset + slope * _times(dr.detach(image), factor))
+        by_target = -share * (offset + slope * _times(dr.detach(terms[0][1]), factor))
     return ViewResult(dr.detach(value), state, by_factor, by_target)
 
 
@@ -228,8 +230,8 @@ def _halves(view: Pass) -> list[Pass]:
 
 def _extrapolated(
     loss: Loss, target: ViewTarget, images: list[mi.TensorXf], shares: list[float]
-) -> tuple[mi.Float, mi.TensorXf]:
-    """Extrapolate the loss to an image without noise. Returns this loss, and the mean of the independent ``images``.
+) -> tuple[mi.Float, list[tuple[float, mi.TensorXf]]]:
+    """Extrapolate the loss to an image without noise. Returns this loss, and the factors and images of its terms.
 
     The bias of a smooth loss f at an image of N samples is c / N + O(1 / N²). Let the image I_i have the share s_i of
     the N samples. The bias of f(I_i) is then c / (s_i N) to first order. For two images, the terms c / N therefore
@@ -237,12 +239,12 @@ def _extrapolated(
     loss with respect to the expected image is therefore the sum of the derivatives with respect to the I_i.
     """
     if len(images) == 1:
-        return target.compared(loss, images[0]), images[0]
+        return target.compared(loss, images[0]), [(1.0, images[0])]
     mean = reduce(add, [share * image for share, image in zip(shares, images, strict=True)])
     value = 2 * target.compared(loss, mean)
     for share, image in zip(shares, images, strict=True):
         value -= share * target.compared(loss, image)
-    return value, dr.detach(mean)
+    return value, [(2.0, mean), *((-share, image) for share, image in zip(shares, images, strict=True))]
 
 
 def _times(tensor: mi.TensorXf, factor: mi.TensorXf | None) -> mi.TensorXf:
