@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -12,6 +13,9 @@ from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.optim.adaptive import State
 from pathreplay.inverse.optim.levenberg_marquardt import MOST, LevenbergMarquardt
 from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Half, Matrix, curvature, model_of
+from pathreplay.inverse.parameters.pyramid import Pyramid
+from pathreplay.inverse.parameters.reparameterization import Transform
+from pathreplay.inverse.parameters.variables import Variable, range_of
 from small_job import bits
 
 OPTIONS = Optimizer(type="levenberg-marquardt")
@@ -229,3 +233,21 @@ def test_the_curvature_of_a_regularizer_is_its_second_derivative() -> None:
 
     assert curvature(penalty, np.float32([[0.3], [-4]])) == pytest.approx(A, abs=1e-3)
     assert curvature(lambda v: (0.0, -v), np.float32([1, 2])) == pytest.approx(np.zeros((2, 2)))
+
+
+def test_the_curvature_of_a_regularizer_is_that_within_the_range_of_its_variable() -> None:
+    """Beyond it, a regularizer may be undefined; and where there is no other value, there is no curvature."""
+
+    def entropy(v: np.ndarray) -> tuple[float, np.ndarray]:
+        assert (v > 0).all() and (v <= 1).all()
+        return float((v * np.log(v)).sum()), np.log(v) + 1
+
+    value = np.float32([1e-3, 0.5, 1])
+    found = curvature(entropy, value, (0.0, 1.0))
+    assert found == pytest.approx(np.diag(1 / value), rel=0.2)
+    assert curvature(entropy, np.float32([1]), (1.0, 1.0)) == [[0]]
+    for kind, expected in ((None, (-1.0, 0.7)), ("log", (0.0, 0.7)), ("logit", (-1.0, 0.7))):
+        transform = None if kind is None else Transform(kind, -1.0, 0.7)  # type: ignore[arg-type]
+        for coordinates in (transform, Pyramid([(2, 2, 1)], False, transform)):
+            variable = Variable("a", mi.Float(0), (-1.0, 0.7), 1, value, None, coordinates=coordinates)
+            assert range_of(variable) == expected

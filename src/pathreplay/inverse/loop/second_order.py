@@ -13,6 +13,7 @@ from pathreplay.inverse.optim.levenberg_marquardt import LevenbergMarquardt
 from pathreplay.inverse.parameters.gauss_newton import curvature
 from pathreplay.inverse.parameters.reparameterization import Coordinates
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.variables import range_of
 from pathreplay.inverse.problem.problem import Problem
 
 
@@ -46,7 +47,7 @@ def observe(problem: Problem, optimiser: Optimiser, values: Arrays, evaluation: 
         if v.key not in model.sizes:
             continue
         if v.penalty is not None:
-            model = model.curved(v.key, curvature(v.penalty.of, values[v.key]))
+            model = model.curved(v.key, curvature(v.penalty.of, values[v.key], range_of(v)))
         if v.coordinates is not None:
             maps[v.key] = partial(_by_latent, v.coordinates, values[v.key])
     optimiser.observe(model.mapped(maps))

@@ -172,22 +172,27 @@ def _tiles(images: Matrix) -> Matrix:
     return images.reshape(len(images), -1)
 
 
-def curvature(penalty: Callable[[Array], tuple[float, Array]], value: Array) -> Matrix:
+def curvature(
+    penalty: Callable[[Array], tuple[float, Array]], value: Array, within: tuple[float, float] = (-np.inf, np.inf)
+) -> Matrix:
     """Compute the Hessian of a regularizer by finite differences of its gradient. Negative eigenvalues are set to 0.
 
     Args:
         penalty: value and gradient of the regularizer as a function of the variable.
         value: the variable.
+        within: lower and upper end of the range of the variable. The regularizer may be undefined at the ends and
+            beyond, so entries move at most half of their distance from them.
     """
     columns = []
     for k, entry in enumerate(value.ravel().tolist()):
         slopes, ends = [], []
         for side in (1, -1):
             moved = value.copy()
-            moved.flat[k] += np.float32(side * DIFFERENCE * max(abs(entry), DIFFERENCE))
+            farthest = 0.5 * (within[0] - entry), 0.5 * (within[1] - entry)
+            moved.flat[k] += np.float32(np.clip(side * DIFFERENCE * max(abs(entry), DIFFERENCE), *farthest))
             ends.append(float(moved.flat[k]))
             slopes.append(penalty(moved)[1].astype(np.float64).ravel())
-        columns.append((slopes[0] - slopes[1]) / (ends[0] - ends[1]))
+        columns.append((slopes[0] - slopes[1]) / ((ends[0] - ends[1]) or 1.0))  # equal ends: the slopes are equal, too
     matrix = np.array(columns)
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return (vectors * np.maximum(values, 0)) @ vectors.T

@@ -81,6 +81,15 @@ def latent_bounds(variable: Variable) -> tuple[float, float]:
     return -np.inf, np.inf
 
 
+def range_of(variable: Variable) -> tuple[float, float]:
+    """Return the ends of the interval that values of a variable never leave: bounds, and the range of a `Transform`."""
+    lower, upper = variable.bounds
+    transform = variable.coordinates.inner if isinstance(variable.coordinates, Pyramid) else variable.coordinates
+    if isinstance(transform, Transform):
+        lower, upper = max(lower, transform.lower), min(upper, transform.upper)
+    return lower, upper
+
+
 def keys_of(
     params: mi.SceneParameters,
     recovered: Sequence[Parameter],
