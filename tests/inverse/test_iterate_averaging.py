@@ -142,6 +142,18 @@ def test_averaging_changes_the_result_of_a_job_but_not_its_iterates(room: Path) 
     assert optimize(make_config(fast), progress=False).parameters[key] == pytest.approx(on.parameters[key], abs=1e-5)
 
 
+@pytest.mark.parametrize("before", [True, False])
+def test_a_run_may_go_on_with_another_averaging(before: bool, room: Path) -> None:
+    (room / "job.json").write_text(json.dumps({**JOB, "spp": 2}))
+    problem = pathreplay.load_job("job.json")
+    results = [
+        pathreplay.minimize(problem, {"type": "adam", "iterate_averaging": averages}, steps=steps, output="run", **more)
+        for averages, steps, more in ((before, 3, {}), (not before, 6, {"resume": True}))
+    ]
+    assert [len(result.history) for result in results] == [3, 6]
+    assert results[1].history[:3] == results[0].history
+
+
 def test_a_step_returns_the_average_and_goes_on_from_the_iterate(room: Path) -> None:
     (room / "job.json").write_text(json.dumps({**JOB, "spp": 2, "learning_rate": 0.1}))
     problem = pathreplay.load_job("job.json")

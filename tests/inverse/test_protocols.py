@@ -10,7 +10,7 @@ import pytest
 
 from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Executor, Local, Shard, total
-from pathreplay.inverse.optim.adaptive import DrJitOptimiser, Optimiser
+from pathreplay.inverse.optim.adaptive import DrJitOptimiser, Optimiser, State
 from pathreplay.inverse.optim.averaging import Averaged
 from small_job import bits
 
@@ -111,6 +111,33 @@ def test_a_state_of_another_optimiser_is_refused() -> None:
     go_on(optimiser, start(), 1)
     with pytest.raises(ValueError, match="is not a state array of this optimizer"):
         DrJitOptimiser(start(), Optimizer(type="sgd")).restore(optimiser.state(), start())
+
+
+def test_averaging_may_begin_and_end_within_a_run() -> None:
+    """Iterates go on in any case. Means that are not there begin with the next step, and can be stored again."""
+    plain, averaging = DrJitOptimiser(start()), Averaged(DrJitOptimiser(start()))
+    values = go_on(plain, start(), 5)
+    go_on(averaging, start(), 5)
+    without, begins, anew = (
+        DrJitOptimiser(start()),
+        Averaged(DrJitOptimiser(start())),
+        Averaged(DrJitOptimiser(start())),
+    )
+    without.restore(averaging.state(), values)
+    begins.restore(plain.state(), values)
+    assert begins.answer(values) == {}
+    after = go_on(plain, values, 4)
+    assert bits(go_on(without, values, 4)) == bits(after) == bits(go_on(begins, values, 4))
+    anew.restore(begins.state(), after)
+    assert bits(anew.state().arrays) == bits(begins.state().arrays)
+    assert bits(anew.answer(after)) == bits(begins.answer(after)) != {}
+    arrays = dict(averaging.state().arrays)
+    for change in ({"scatter:grid": np.float64([1, 5])}, {"scatter:grid": np.float64([1, 0.5])}):
+        with pytest.raises(ValueError, match="iterates in 5 steps"):
+            anew.restore(State(averaging.state().steps, {**arrays, **change}), values)
+    del arrays["long:grid"]
+    with pytest.raises(KeyError):
+        anew.restore(State(averaging.state().steps, arrays), values)
 
 
 def counting(values: Mapping[str, np.ndarray], shard: Shard, learned: Mapping[str, np.ndarray], /) -> Evaluation:

@@ -22,6 +22,8 @@ _CLASSES = {"adam": drjit.opt.Adam, "adamw": drjit.opt.AdamW, "sgd": drjit.opt.S
 _FIRST, _SECOND, _GREATEST, _VELOCITY = "first", "second", "greatest", "velocity"
 _KEPT = {"sgd": (_VELOCITY,), "rmsprop": (_SECOND,)}
 _MOMENTS = _FIRST, _SECOND, _GREATEST
+MEANS = "short:", "long:", "scatter:"
+"""Prefixes of the state arrays of `Averaged`, which an optimiser without averaging ignores."""
 PIECE = 2**22
 """Maximum number of entries per step. Larger variables are stepped in pieces, to limit temporary arrays to 16 MB."""
 
@@ -205,7 +207,8 @@ class DrJitOptimiser:
                 arrays = tuple(restored.get(what) for what in self._names)
                 kept = (type(kept[0])(state.steps[key]), *arrays) if self._moments else arrays[0]
                 part.state[name] = stored, promoted, rate, kept
-        if rest := set(state.arrays) - set(self.state().arrays):
+        given = {name for name in state.arrays if not name.startswith(MEANS)}
+        if rest := given - set(self.state().arrays):
             raise ValueError(f"'{min(rest)}' is not a state array of this optimizer")
 
 

@@ -25,7 +25,7 @@ from functools import partial
 
 import numpy as np
 
-from pathreplay.inverse.optim.adaptive import Optimiser, State, WhenAsked
+from pathreplay.inverse.optim.adaptive import MEANS, Optimiser, State, WhenAsked
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 SHORT, LONG = 8, 3
@@ -34,7 +34,7 @@ MOST = 2**24
 """Maximum number of entries of an averaged variable. The means of larger variables would take too much memory."""
 BLOCK = 2**16
 """Number of entries that are processed at once, so that temporary arrays stay in the processor's cache."""
-_SHORT, _LONG, _SCATTER = "short:", "long:", "scatter:"
+_SHORT, _LONG, _SCATTER = MEANS
 
 
 @dataclass
@@ -117,32 +117,34 @@ class Averaged:
         }
 
     def state(self) -> State:
-        """See `Optimiser`. The additional arrays are the two means and s."""
+        """See `Optimiser`. The additional arrays are the two means, and an array of s and the number of iterates."""
         state = self._optimiser.state()
         makers = {name: partial(state.arrays.__getitem__, name) for name in state.arrays}
         for key, means in self._means.items():
-            own = {_SHORT: means.short, _LONG: means.long, _SCATTER: np.array([means.scatter])}
+            own = {_SHORT: means.short, _LONG: means.long, _SCATTER: np.array([means.scatter, means.count])}
             makers |= {what + key: partial(np.copy, array) for what, array in own.items()}
         return State(state.steps, WhenAsked(makers))
 
     def restore(self, state: State, values: Arrays) -> None:
-        """See `Optimiser`."""
-        own = (_SHORT, _LONG, _SCATTER)
-        names = [name for name in state.arrays if not name.startswith(own)]
+        """See `Optimiser`. The means of a variable whose means are not in the state begin with its next step."""
+        stored = set(state.arrays)
+        names = [name for name in state.arrays if not name.startswith(MEANS)]
         rest = WhenAsked({name: partial(state.arrays.__getitem__, name) for name in names})
         self._optimiser.restore(State(state.steps, rest), values)
         self._means = {}
         for key, count in state.steps.items():
-            if not count or values[key].size > MOST:
+            if not count or values[key].size > MOST or stored.isdisjoint(what + key for what in MEANS):
                 continue
-            short, long, scatter = (np.array(state.arrays[what + key]) for what in own)
+            short, long, scatter = (np.array(state.arrays[what + key]) for what in MEANS)
             for mean in (short, long):
                 if mean.shape != values[key].shape or mean.dtype != values[key].dtype:
                     raise ValueError(f"the means of '{key}' do not have the type of its value")
-            if scatter.shape != (1,) or scatter.dtype != np.float64 or scatter[0] < 0:
-                raise ValueError(f"'{_SCATTER}{key}' is not a positive number")
+            if scatter.shape != (2,) or scatter.dtype != np.float64 or scatter[0] < 0:
+                raise ValueError(f"'{_SCATTER}{key}' is not a positive number and a count")
             # The first step of a variable initialises the means with a value that is not an iterate.
-            self._means[key] = _Means(short, long, float(scatter[0]), count - 1)
+            if scatter[1] not in range(count):
+                raise ValueError(f"'{_SCATTER}{key}' counts {scatter[1]:g} iterates in {count} steps")
+            self._means[key] = _Means(short, long, float(scatter[0]), int(scatter[1]))
 
 
 def _weight(eta: int, n: int) -> float:
