@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import types
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from pathreplay.inverse.optim.adaptive import State
 from pathreplay.inverse.optim.lbfgs import MOST, LineSearch
 from pathreplay.inverse.optim.levenberg_marquardt import LevenbergMarquardt
 from pathreplay.inverse.parameters.gauss_newton import GaussNewton
+from pathreplay.inverse.parameters.mesh import Surface
 from pathreplay.inverse.parameters.reparameterization import Transform
 from pathreplay.inverse.parameters.variables import Variable, latent_bounds, latents
 from pathreplay.jobs import iterate, make_config, optimize
@@ -158,6 +160,19 @@ def test_an_active_bound_of_a_transformed_value_is_solved_for(transform: str, ki
         if search.finished:
             break
     assert [*values["a"], *values["b"]] == pytest.approx([1, 0.5 + 1.6 / 1.64], abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["l-bfgs-b", "levenberg-marquardt"])
+def test_large_steps_of_coincident_vertices_are_refused(kind: str) -> None:
+    """Each of two vertices at one place has the gradient of both."""
+    positions = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    for points, faces in ((positions, [[0, 1, 2], [1, 2, 3]]), (positions[[0, 1, 2, 3, 1, 2]], [[0, 1, 2], [4, 5, 3]])):
+        surface = Surface(points.ravel(), np.array(faces), 2.0)
+        variable = Variable("mesh", mi.Float(0), (-np.inf, np.inf), 0.1, points.ravel(), None, coordinates=surface)
+        problem = types.SimpleNamespace(variables=(variable,))
+        with nullcontext() if len(points) == 4 else pytest.raises(PathreplayError, match="vertices at equal positions"):
+            optimiser_of(problem, {"mesh": points.ravel()}, Optimizer(type=kind))  # type: ignore[arg-type]
+        optimiser_of(problem, {"mesh": points.ravel()}, Optimizer(type="adam"))  # type: ignore[arg-type]
 
 
 def test_bounds_of_latents_are_those_that_the_transform_does_not_enforce() -> None:

@@ -51,6 +51,7 @@ from pathreplay.inverse.optim.lbfgs import LineSearch, Search
 from pathreplay.inverse.optim.levenberg_marquardt import LevenbergMarquardt
 from pathreplay.inverse.parameters.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.parameters.grids import resampled
+from pathreplay.inverse.parameters.mesh import Surface
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import latent_bounds, latents
 from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, sensor_of
@@ -95,9 +96,19 @@ def new_run(
 
 
 def optimiser_of(problem: Problem, values: Arrays, options: Optimizer, search: Search | None = None) -> Optimiser:
-    """Create the optimiser of the problem's variables at these values. For ``search`` see `LineSearch`."""
+    """Create the optimiser of the problem's variables at these values. For ``search`` see `LineSearch`.
+
+    Raises PathreplayError if the optimiser cannot step the variables.
+    """
     values = latents(problem.variables, values)
     if options.searches:
+        for v in problem.variables:
+            if isinstance(v.coordinates, Surface) and v.coordinates.merges:
+                # Searches need the exact gradient. For Adam, the gradient of a position does not depend on its copies.
+                raise PathreplayError(
+                    f"The mesh of '{v.key}' has vertices at equal positions, for which 'large_steps_lambda' cannot be "
+                    f"combined with optimizer type = '{options.type}'; remove it, merge the vertices, or use 'adam'"
+                )
         bounds = {v.key: latent_bounds(v) for v in problem.variables}
         if options.is_second_order and search is None:
             return LevenbergMarquardt(values, options, bounds)

@@ -40,6 +40,11 @@ class Surface:
         self._matrix = (scipy.sparse.identity(adjacent.shape[0]) + smooth * laplacian).tocsc()
         self._solver = scipy.sparse.linalg.splu(self._matrix)
 
+    @property
+    def merges(self) -> bool:
+        """Whether several vertices share a position, and therefore each have the whole gradient of this position."""
+        return len(self._copies) > self._matrix.shape[0]
+
     def latent(self, values: Array) -> Array:
         """Compute u from v."""
         points = np.zeros((self._matrix.shape[0], 3))
