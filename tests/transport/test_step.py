@@ -16,6 +16,8 @@ from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative
 from pathreplay.adjoint.record import Layout, record_type, room_for
 from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, record_path, sweep_path
 from pathreplay.integrators.lifetimes import careful
+from pathreplay.platform import compat
+from pathreplay.transport.emitters import redraw_emitter
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
@@ -155,6 +157,30 @@ def test_signatures_tell_the_edge_of_a_shape() -> None:
     shape = np.array(step.signature.shape)
     assert shape[0] == shape[1] != shape[2]
     assert list(step.signature.met) == [True, True, True, False]
+
+
+def test_a_rectangle_light_grows_once() -> None:
+    """Mitsuba calls it a mesh, but differentiates its area itself, whether or not the vertices of a mesh light move."""
+    T, glow = mi.ScalarTransform4f, {"type": "area", "radiance": 5.0}
+    panel = {"type": "rectangle", "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(0.4)}
+    box = {"type": "cube", "to_world": T().translate([3, 0, 2]).scale(0.2)}
+    lamps = {name: {**shape, "emitter": glow} for name, shape in (("panel", panel), ("box", box))}
+    u = mi.Point2f(np.random.default_rng(1).random((2, LANES), np.float32))
+    found = []
+    for deforms in (False, True):
+        world = scene({"type": "diffuse"}, **lamps)
+        params, t = mi.traverse(world), mi.Float(0)
+        dr.enable_grad(t)
+        params["panel.to_world"] = mi.Transform4f(params["panel.to_world"]) @ mi.Transform4f().scale(1 + t)
+        if deforms:
+            dr.enable_grad(params[f"box.{compat.positions_name()}"])
+        params.update()
+        trace = walk_of(world)
+        assert trace.traits.lights_deform == deforms
+        _, Le = redraw_emitter(trace, dr.zeros(mi.Interaction3f), u, None, True, mi.Bool(True))
+        dr.backward(Le)
+        found.append(np.array(dr.grad(t))[0])
+    assert found[0] > 0 and found[1] == pytest.approx(found[0], rel=1e-5)
 
 
 # ------------------------------ The way back, with something given beyond ------------------------------
