@@ -16,6 +16,7 @@ from pathreplay.testing.statistics import gap
 from pathreplay.testing.stencil import WIDE
 from pathreplay.testing.verdict import Z_LIMIT
 from places import SUPPORT
+from variant import SPECTRAL as SPECTRAL_VARIANT
 
 SEEDS, SPP = 12, 64
 
@@ -68,6 +69,28 @@ for found in (gradients, images):
 def test_majorants_of_colours_in_spectral_variants(run_python: Callable[..., Any]) -> None:
     done = run_python(SPECTRAL, args=(str(SUPPORT),))
     print(done.stdout)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+TABULATED = """
+import sys
+from pathreplay.platform.backend import set_variant
+set_variant(sys.argv[1])
+import mitsuba as mi
+from pathreplay.transport.volume.media import scene_media
+
+table = {"type": "irregular", "wavelengths": "400,550,700", "values": "0.05,0.5,4"}
+regular = {"type": "regular", "wavelength_min": 400, "wavelength_max": 700, "values": "0.05,0.5,4"}
+for kind in ("homogeneous", "heterogeneous"):
+    for sigma_t, expected in ((table, True), (regular, True), (0.5, False)):
+        volume = {"type": "constvolume", "value": sigma_t}
+        found = scene_media([mi.load_dict({"type": kind, "sigma_t": volume})], False, None).chromatic
+        assert found == expected, (kind, sigma_t, found)
+"""
+
+
+def test_tabulated_extinction_differs_between_wavelengths(run_python: Callable[..., Any]) -> None:
+    done = run_python(TABULATED, args=(SPECTRAL_VARIANT,))
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -72,7 +72,7 @@ def _is_chromatic(medium: mi.Medium) -> bool:
     params = mi.traverse(medium)
     extinction = [params[key] for key in params.keys() if key.startswith("sigma_t.")]
     one_number = [
-        value.shape[-1] == 1 if dr.is_tensor_v(value) else not dr.is_vector_v(value)
+        value.shape[-1] == 1 if dr.is_tensor_v(value) else not dr.is_vector_v(value) and dr.width(value) == 1
         for value in extinction
         if dr.is_tensor_v(value) or dr.is_diff_v(value)
     ]
