@@ -566,3 +566,25 @@ print("fine")
 def test_other_variants(run_python: Any, variant: str) -> None:
     done = run_python(OTHER_VARIANT, args=(variant,))
     assert "fine" in done.stdout, done.stderr  # Mitsuba colours its log, at either end
+
+
+COLOUR = """
+import sys
+from pathreplay.platform.backend import set_variant
+set_variant(sys.argv[1])
+import drjit as dr, mitsuba as mi, numpy as np
+at = dr.zeros(mi.MediumInteraction3f, 471)
+at.wavelengths = type(at.wavelengths)(dr.linspace(mi.Float, 360, 830, 471))
+for value in ([0.9, 0.02, 0.02], [0.02, 0.9, 0.02], [0.1, 0.2, 0.9], [3, 0.1, 1]):
+    medium = mi.load_dict({"type": "gridmedium", "sigma_t": {"type": "rgb", "value": value}, "scale": 2.0})
+    largest = np.max(medium.get_scattering_coefficients(at)[2])
+    assert largest <= medium.majorant[0] < 1.02 * largest, (value, medium.majorant, largest)
+medium = mi.load_dict({"type": "gridmedium", "sigma_t": 0.7})
+assert abs(medium.majorant[0] - 0.7) < 1e-6, medium.majorant
+print("fine")
+"""
+
+
+def test_the_majorant_of_a_colour_bounds_its_spectrum(run_python: Any) -> None:
+    done = run_python(COLOUR, args=(SPECTRAL,))
+    assert "fine" in done.stdout, done.stderr

@@ -40,6 +40,11 @@ from pathreplay.plugins.supergrid import (
 #: Half the side of the cube that a `constvolume` fills if a property is given as a number. The cube is larger than any
 #: scene, and its coordinates do not overflow. Without a transform, a `constvolume` fills only the unit cube.
 FAR = 1e6
+#: First and last wavelength (nm) and number of wavelengths of the search for the maximum of a spectrum. Mitsuba returns
+#: the mean instead of the maximum of a spectrum that it has made from a colour.
+WAVELENGTHS = 360, 830, 512
+#: Ratio of the bound to the maximum that was found. Spectra of colours are smooth.
+ABOVE = 1.01
 
 
 SIGMA_T = Property(
@@ -297,4 +302,14 @@ def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
         here = dr.detach(volume.eval(dr.zeros(mi.Interaction3f)))
         lowest, highest = float(dr.min(here)[0]), float(dr.max(here)[0])
     grey = mi.is_monochromatic or (bool(values) and grey)
+    if volume.class_name() == "ConstVolume" and mi.is_spectral and not grey:
+        highest = max(highest, ABOVE * _largest_in_spectrum(volume))
     return not grey, [constant_bounds(volume, lowest, (lowest + highest) / 2, highest)]
+
+
+def _largest_in_spectrum(volume: mi.Volume) -> float:
+    """Return the largest value of a volume without spatial variation, at the wavelengths of `WAVELENGTHS`."""
+    λ = dr.linspace(mi.Float, *WAVELENGTHS)
+    at = dr.zeros(mi.Interaction3f, dr.width(λ))
+    at.wavelengths = type(at.wavelengths)(λ)
+    return float(dr.max(dr.detach(volume.eval(at)), axis=None)[0])
