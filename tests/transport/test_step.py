@@ -18,11 +18,13 @@ from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, record_path
 from pathreplay.integrators.lifetimes import careful
 from pathreplay.platform import compat
 from pathreplay.transport.emitters import redraw_emitter
+from pathreplay.transport.meet import meet
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.step import Visit, choose_step, repeat_step
 from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples
+from pathreplay.transport.volume.passage import skip_null
 
 
 @pytest.fixture(autouse=True)
@@ -35,6 +37,7 @@ def _care() -> Iterator[None]:
 
 LANES = 256
 GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+GROUP = {"type": "ref", "id": "group"}
 MIRROR = {"type": "conductor", "specular_reflectance": {"type": "spectrum", "value": 0.8}}
 
 
@@ -181,6 +184,21 @@ def test_a_rectangle_light_grows_once() -> None:
         dr.backward(Le)
         found.append(np.array(dr.grad(t))[0])
     assert found[0] > 0 and found[1] == pytest.approx(found[0], rel=1e-5)
+
+
+@pytest.mark.parametrize("copied", [False, True], ids=["itself", "copied"])
+def test_null_boundaries_are_skipped(copied: bool) -> None:
+    """Also those of a box in an instance."""
+    place = mi.ScalarTransform4f().scale(0.4).translate([0, 0, 2])
+    cube = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+    copy = {"group": {"type": "shapegroup", "fog": cube}, "copy": {"type": "instance", "of": GROUP}}
+    trace = walk_of(scene({"type": "diffuse"}, **(copy if copied else {"fog": cube})))
+    down = mi.Ray3f(mi.Point3f(mi.Float([0.1, 0.7]), 0.1, 2), mi.Vector3f(0, 0, -1))
+    with dr.suspend_grad():
+        first = meet(trace, down, mi.Bool(True))
+        behind = skip_null(trace, down, first, mi.Bool(True))
+    assert np.allclose(first.t, [0.8, 2])
+    assert np.allclose(behind.t, 2)
 
 
 # ------------------------------ The way back, with something given beyond ------------------------------
