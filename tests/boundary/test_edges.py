@@ -27,6 +27,7 @@ from pathreplay.integrators.scene_facts import SceneFacts
 from pathreplay.platform.threads import one_thread
 from pathreplay.samplers.counter_sampler import ROUNDS, CounterSampler, key_of, quasi_random
 from pathreplay.transport.facts.smoothing_groups import smoothing_groups
+from truth import camera
 
 
 def world(**film: Any) -> mi.Scene:
@@ -259,6 +260,24 @@ def test_where_nothing_moves_nothing_is_added() -> None:
     for edges in ("all", "auto"):
         assert np.array_equal(found["none"][0], found[edges][0])
         assert found["none"][1] == found[edges][1]
+
+
+def test_edges_before_a_glow_need_no_emitter() -> None:
+    """A card moves before a box of glowing gas: its edge sweeps over the radiance 1 - exp(-2)."""
+    glow = {"type": "gridmedium", "albedo": 0.0, "sigma_t": 1.0, "radiance": 1.0}
+    card = {"type": "rectangle", "to_world": scenes.T().translate([0.3, 0, 2]).scale(0.4)}
+    box = {"type": "cube", "bsdf": {"type": "null"}, "interior": glow}
+    scene = mi.load_dict({"type": "scene", "camera": camera((0, 0, 5)), "card": card, "box": box}, optimize=False)
+    params, x = mi.traverse(scene), mi.Float(0)
+    dr.enable_grad(x)
+    params["card.to_world"] = mi.Transform4f().translate([x, 0, 0]) @ mi.Transform4f(params["card.to_world"])
+    params.update()
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "boundary": "all"})
+    integrator.render_backward(scene, params, dr.full(mi.TensorXf, 1 / 768, (16, 16, 3)), spp=64)
+    dr.enqueue(dr.ADMode.Backward, params["card.to_world"].matrix)
+    dr.traverse(dr.ADMode.Backward)
+    width = 2 * 3 * np.tan(np.deg2rad(5))  # of what the camera sees, where the card is
+    assert np.array(dr.grad(x)) == pytest.approx((1 - np.exp(-2)) / width, rel=0.05)
 
 
 def test_the_cone_around_a_mesh_lamp_follows_it() -> None:

@@ -60,7 +60,9 @@ class SampledEmitter:
 
     @staticmethod
     def of(trace: TraceConfig, index: mi.UInt32, active: mi.Bool) -> SampledEmitter:
-        """Look up an emitter by its index in the scene."""
+        """Look up an emitter by its index in the scene. Without emitters, ``ptr`` is None, and its samples are zero."""
+        if not trace.scene.emitters():
+            return SampledEmitter(dr.zeros(mi.EmitterPtr), mi.Point3f(0), mi.Float(0), mi.Bool(False))
         ptr = dr.gather(mi.EmitterPtr, trace.scene.emitters_dr(), index, active)
         polar = mi.Bool(False)
         if trace.traits.sphere_lights:
