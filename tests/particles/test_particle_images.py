@@ -169,6 +169,23 @@ def test_short_paths_are_those_of_path(depth: int, hide: bool) -> None:
         assert both(name, scene, "pathreplay_particles", MANY, max_depth=depth, hide_emitters=hide) < Z_LIMIT
 
 
+def test_hidden_emitters_do_not_uncover_what_is_behind_the_camera() -> None:
+    """A floor seen through a hidden lamp, below a black ceiling that is above the camera."""
+    T = mi.ScalarTransform4f
+    look = T().look_at([0, 3, 0], [0, 0, 0], [0, 0, 1])
+    scene = {
+        "type": "scene",
+        "camera": {"type": "perspective", "fov": 10, "to_world": look, "film": particle_scenes.film("box")},
+        "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2)},
+        "lamp": {"type": "rectangle", "to_world": T().translate([0, 1.5, 0]).rotate([1, 0, 0], 90).scale(0.4),
+                 "emitter": {"type": "area"}},
+        "ceiling": {"type": "rectangle", "to_world": T().translate([0, 4, 0]).rotate([1, 0, 0], 90).scale(2),
+                    "bsdf": {"type": "diffuse", "reflectance": 0.0}},
+    }  # fmt: skip
+    options = {"max_depth": 2, "hide_emitters": True}
+    assert both("hidden lamp", mi.load_dict(scene), "pathreplay_particles", FEW, **options) < Z_LIMIT
+
+
 VARIANTS = """
 import json, sys
 sys.path[:0] = sys.argv[2:]
