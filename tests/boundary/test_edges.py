@@ -20,6 +20,7 @@ from pathreplay.boundary.crofton import BEYOND, BISECTIONS, PlaneSegment, Visibi
 from pathreplay.boundary.emitters import BORDER, sample_at
 from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.boundary.search import Resampled, SegmentDensity
+from pathreplay.boundary.volumetric import VolumetricSearch
 from pathreplay.integrators.boundary_term import INNER_LENGTHS
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
@@ -362,6 +363,18 @@ def test_chains_in_fog_are_not_ended_by_roulette() -> None:
         T, _ = transmittance_of_chain(trace, ray, key, mi.UInt32(4), mi.Float(reach), mi.Bool(True))
     length = (5 + 3 * 6) / dr.abs(ray.d.z) + reach
     assert np.array(T) == pytest.approx(np.exp(-0.25 * np.array(length)) * np.ones((3, 1)), rel=0.02)
+
+
+@pytest.mark.parametrize(("depth", "by_chance", "dark"), [(2, False, False), (2, True, True)])
+def test_beams_have_edges_where_they_are_seen(depth: int, by_chance: bool, dark: bool) -> None:
+    """Not if only chance finds a light, which never finds a point."""
+    scene = mi.load_dict(media.shadow_in_fog(media.point, **(media.BY_CHANCE if by_chance else {}))())
+    view = Pass.of(scene, 0, 0, 1)
+    trace = mi.load_dict({"type": "pathreplay", "max_depth": depth})._trace_config(scene, view.sensor)
+    with dr.suspend_grad():
+        edges = VolumetricSearch.of(trace, FilmPlaces.of(view), 0.5).find(2000, 200, mi.UInt32(1))
+        weight = np.abs(edges.crossings[0].weight).sum()
+    assert (weight == 0) == dark
 
 
 def test_a_single_line_has_a_place() -> None:

@@ -111,12 +111,16 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
     def _radiance(
         self, ray: mi.Ray3f, segment: BeamSegment, observer: ObserverVertex, shadow: HardShadow, lit_test: ShadowTest
     ) -> mi.Spectrum:
-        """Estimate f, the radiance that the lit medium point scatters to the camera."""
-        trace, active = self.trace, observer.active
+        """Estimate f, the radiance that the lit medium point scatters to the camera.
+
+        It is zero if the medium does not use emitter sampling.
+        """
+        trace, active = self.trace, observer.active & observer.at.medium.use_emitter_sampling()
         sampler = CounterSampler.stream(segment.key, Stream.TRANSMITTANCE_OF_BEAM)
         T = transmittance_up_to(trace, ray, segment.τ, medium_around(trace), sampler, active)[0]
         T *= transmittance_past_edge(trace, lit_test.ray, shadow.test.hit.t, observer.at.medium, sampler, active)
-        return T * observer.selected.β * observer.towards(lit_test.ray.d, active)[0] * lit_test.Le
+        f = T * observer.selected.β * observer.towards(lit_test.ray.d, active)[0] * lit_test.Le
+        return dr.select(active, f, 0)
 
     def _hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """Return the first hit of a ray on a surface that is not a null boundary."""
