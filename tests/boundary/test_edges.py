@@ -365,9 +365,9 @@ def test_chains_in_fog_are_not_ended_by_roulette() -> None:
     assert np.array(T) == pytest.approx(np.exp(-0.25 * np.array(length)) * np.ones((3, 1)), rel=0.02)
 
 
-@pytest.mark.parametrize(("depth", "by_chance", "dark"), [(2, False, False), (2, True, True)])
+@pytest.mark.parametrize(("depth", "by_chance", "dark"), [(2, False, False), (1, False, True), (2, True, True)])
 def test_beams_have_edges_where_they_are_seen(depth: int, by_chance: bool, dark: bool) -> None:
-    """Not if only chance finds a light, which never finds a point."""
+    """Not if paths end before they are scattered, or if only chance finds a light, which never finds a point."""
     scene = mi.load_dict(media.shadow_in_fog(media.point, **(media.BY_CHANCE if by_chance else {}))())
     view = Pass.of(scene, 0, 0, 1)
     trace = mi.load_dict({"type": "pathreplay", "max_depth": depth})._trace_config(scene, view.sensor)

@@ -113,9 +113,10 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
     ) -> mi.Spectrum:
         """Estimate f, the radiance that the lit medium point scatters to the camera.
 
-        It is zero if the medium does not use emitter sampling.
+        It is zero if the medium does not use emitter sampling, or if paths are too short to be scattered.
         """
-        trace, active = self.trace, observer.active & observer.at.medium.use_emitter_sampling()
+        trace = self.trace
+        active = observer.active & observer.at.medium.use_emitter_sampling() & (trace.max_depth > 1)
         sampler = CounterSampler.stream(segment.key, Stream.TRANSMITTANCE_OF_BEAM)
         T = transmittance_up_to(trace, ray, segment.τ, medium_around(trace), sampler, active)[0]
         T *= transmittance_past_edge(trace, lit_test.ray, shadow.test.hit.t, observer.at.medium, sampler, active)
