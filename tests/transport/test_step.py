@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import driven
 from media_scenes import constant, grid
 from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative
 from pathreplay.adjoint.record import Layout, record_type, room_for
@@ -199,6 +200,19 @@ def test_null_boundaries_are_skipped(copied: bool) -> None:
         behind = skip_null(trace, down, first, mi.Bool(True))
     assert np.allclose(first.t, [0.8, 2])
     assert np.allclose(behind.t, 2)
+
+
+def test_roulette_begins_as_in_prb_and_a_vertex_later_than_in_path() -> None:
+    room = driven.world()
+
+    def image(plugin: str, rr_depth: int, **more: Any) -> np.ndarray:
+        integrator = mi.load_dict({"type": plugin, "max_depth": 8, "rr_depth": rr_depth, **more})
+        return np.array(mi.render(room, integrator=integrator, spp=4, seed=3))
+
+    ours = image("pathreplay", 2, sampling="scene")
+    assert np.allclose(ours, image("prb", 2), atol=1e-5)
+    assert np.allclose(ours, image("path", 3), atol=1e-5)
+    assert np.abs(ours - image("path", 2)).max() > 0.01
 
 
 # ------------------------------ The way back, with something given beyond ------------------------------
