@@ -221,6 +221,26 @@ def test_render_and_dr_backward_and_forward() -> None:
     params.update()
 
 
+def test_alpha_has_no_derivative_in_either_mode() -> None:
+    scene = under_sky(DIFFUSE)
+    scene["camera"]["film"]["pixel_format"] = "rgba"
+    loaded = mi.load_dict(scene)
+    params, key = mi.traverse(loaded), "object.bsdf.reflectance.value"
+    for forward in (True, False):
+        x = mi.Float(0.5)
+        dr.enable_grad(x)
+        params[key] = mi.Color3f(x)
+        params.update()
+        image = mi.render(loaded, params, integrator=plugin(max_depth=3, hide_emitters=True), spp=4)
+        if forward:
+            dr.forward(x)
+            tangent = np.array(dr.grad(image))
+            assert tangent[..., :3].max() > 0 and not tangent[..., 3].any()
+        else:
+            dr.backward(dr.sum(image[:, :, 3], axis=None))
+            assert dr.grad(x)[0] == 0
+
+
 def test_it_loads_from_xml() -> None:
     scene = mi.load_string(
         """<scene version="3.0.0"><integrator type="pathreplay"><integer name="max_depth" value="3"/>

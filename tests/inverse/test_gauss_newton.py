@@ -238,6 +238,31 @@ def test_minimize_takes_it_by_name_and_steps_are_pure(photos: list[np.ndarray]) 
     assert state.values[WALL] == pytest.approx([0.7, 0.3, 0.2], abs=0.02)
 
 
+@pytest.mark.parametrize("plugin", ["pathreplay", "prb"])
+def test_alpha_does_not_displace_the_result(plugin: str) -> None:
+    """The sky behind the ball is transparent; Mitsuba's integrators write alpha itself into the alpha of tangents."""
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    ball = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.2]}}
+    eye = {
+        "type": "perspective",
+        "fov": 40,
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+    }
+    description = {
+        "type": "scene",
+        "eye": {**eye, "film": film},
+        "sun": {"type": "point", "position": [2, 3, 4], "intensity": {"type": "rgb", "value": 40.0}},
+        "ball": {"type": "sphere", "radius": 0.7, "bsdf": ball},
+    }
+    scene = mi.load_dict(description, optimize=False)
+    target = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 3}), spp=256))
+    wanted = {"ball.bsdf.reflectance.value": pathreplay.Parameter(initial=0.5, bounds=(0, 1))}
+    integrator = {"type": plugin, "max_depth": 3}
+    problem = pathreplay.Problem(scene, wanted, pathreplay.View(target=target), integrator=integrator, spp=16)
+    result = pathreplay.minimize(problem, "levenberg-marquardt", steps=4, progress=False)
+    assert result.values["ball.bsdf.reflectance.value"] == pytest.approx([0.7, 0.4, 0.2], abs=0.02)
+
+
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "loss": ({"loss": "l1"}, "needs a sum of squares, which loss = 'l1' is not; use l2 or relative-l2"),
     "odd": ({"spp": 5}, "splits the samples into halves, but spp is 5; set it to a multiple of 2"),

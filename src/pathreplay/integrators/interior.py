@@ -40,8 +40,8 @@ def tangent(view: Pass, trace: TraceConfig, driver: ForwardDriver) -> TermResult
     incomplete gradient.
     """
     rays, lost = view.rays(), NonFiniteCounter()
-    δL, valid, moves = driver(trace, rays.start, lost)
-    image = splat(view, rays, δL, valid)
+    δL, _, moves = driver(trace, rays.start, lost)
+    image = splat(view, rays, δL, mi.Bool(False))  # alpha has no derivative
     if not moves:
         return TermResult(image)
     dr.eval(image)  # the kernel of the image also counts the paths with an incomplete gradient

@@ -152,7 +152,12 @@ class Jacobians:
             image, state = run(scene, integrator, state, request)
         self._traced.add((key, view))
         integrator.keep(scene, state)
-        return np.array(image, np.float32)
+        result = np.array(image, np.float32)
+        film = scene.sensors()[request.sensor].film()
+        if key != IMAGE and mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+            # Alpha has no derivative. Mitsuba's integrators write alpha itself into this channel of tangents.
+            result[..., film.base_channels_count() - 1] = 0
+        return result
 
 
 def _image(
