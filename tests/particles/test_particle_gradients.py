@@ -97,6 +97,7 @@ CELLS = (
     cell("point, rough", partial(dome, bsdf=ROUGH), "light.position", add([0.3, 0.5, 0.7]), **ONCE),
     cell("spot", partial(dome, "spot"), "light.to_world", POSE, depth=2, step=3e-3),
     cell("area", partial(dome, "area"), "light.to_world", POSE, **ONCE),
+    cell("sphere", partial(dome, "sphere"), "light.to_world", POSE, **ONCE),
     cell("projector", partial(dome, "projector"), "light.to_world", translate(0.3, 0.5, 0.7), **ONCE),
     cell("directional", partial(plane, "directional", bsdf=ROUGH), "light.to_world", rotate(0.3, 0.5, 0.7), **ONCE),
     cell("beam", partial(plane, "directionalarea"), "light.to_world", POSE, depth=2, step=3e-3),
@@ -107,7 +108,7 @@ CELLS = (
     cell("reflectance", dome, "dome.bsdf.brdf_0.reflectance.data", random(0.5), step=1e-2),
 )
 BY_NAME = {c.name: c for c in CELLS}
-QUICK = ("heights, mirror", "thin lens", "receiver")
+QUICK = ("heights, mirror", "thin lens", "receiver", "sphere")
 
 
 @contextmanager

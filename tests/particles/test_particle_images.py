@@ -121,6 +121,18 @@ def test_light_paths_give_the_image_of_path_in_the_long_run(cell: Cell) -> None:
     assert compare_cell(cell, MANY) < Z_LIMIT
 
 
+@pytest.mark.parametrize("flips", [False, True])
+@pytest.mark.parametrize("angle", [0, 30, 180])
+def test_rotated_spheres_shine_as_unrotated_ones(angle: float, flips: bool) -> None:
+    """Mitsuba samples directions of spheres around normals that it does not rotate."""
+    T = mi.ScalarTransform4f
+    place = T().translate([0.2, 2.2, 0.3]) @ T().rotate([0, 0.6, 0.8], angle)
+    lamp = {**emitters()["sphere"](), "to_world": place @ T().scale(4 if flips else 0.3), "flip_normals": flips}
+    del lamp["center"], lamp["radius"]
+    scene = mi.load_dict({**room(), "light": lamp})
+    assert both(f"sphere, {angle} degrees", scene, "pathreplay_particles", FEW, max_depth=2) < Z_LIMIT
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("weights", [(1.0, 1.0, 1.0), (1.0, 0.3, 2.0), (0.0, 1.0, 1.0)])
 def test_light_paths_start_at_all_emitters(weights: tuple[float, float, float]) -> None:

@@ -309,6 +309,10 @@ def dome(light: str = "point", eye: str = "perspective", bsdf: dict | None = Non
             "type": "rectangle", "to_world": down @ T().translate([0, 0, -0.9]) @ T().scale(0.3),
             "emitter": {"type": "area", "radiance": rgb(8, 7, 6)},
         },
+        "sphere": lambda: {
+            "type": "sphere", "to_world": down @ T().translate([0, 0, -0.9]) @ T().scale(0.2),
+            "emitter": {"type": "area", "radiance": rgb(8, 7, 6)},
+        },
         "painted area": lambda: {
             "type": "rectangle", "to_world": down @ T().translate([0, 0, -0.9]) @ T().scale(0.3),
             "emitter": {"type": "area", "radiance": painted(colours(4, 4, low=2, high=30))},

@@ -30,6 +30,7 @@ EMITTERS = frozenset(
     }
 )
 MAP = "EnvironmentMapEmitter"
+SPHERE = "Sphere"
 
 # Largest accepted distance between the origin of a ray and the triangle that emitted the ray. The unit is the distance
 # by which Mitsuba offsets origins along the normal. Only rays nearly parallel to the triangle have a larger distance.
@@ -61,6 +62,7 @@ class Emission:
     weights: tuple[float, ...]  # relative probability of starting a path, for each emitter
     maps: tuple[mi.Emitter, ...]  # environment maps
     rounded: tuple[mi.Emitter, ...]  # emissive meshes with interpolated normals
+    spheres: tuple[mi.Emitter, ...]  # emissive spheres whose origins Mitsuba samples uniformly
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor, caustics: bool) -> Emission | None:
@@ -77,7 +79,8 @@ class Emission:
             if weight > 0:
                 _require_rays(each)
         maps = tuple(each for each in emitters if each.class_name() == MAP)
-        return Emission(scene, sensor, tuple(weights), maps, tuple(filter(_has_smooth_mesh, emitters)))
+        rounded, spheres = (tuple(filter(test, emitters)) for test in (_has_smooth_mesh, _is_uniform_sphere))
+        return Emission(scene, sensor, tuple(weights), maps, rounded, spheres)
 
     def pick(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Select an emitter; return its index, a random number independent of the index, and its probability."""
@@ -119,6 +122,10 @@ class Emission:
             disk = mi.warp.square_to_uniform_disk_concentric(u.place)
             start = mi.Frame3f(dr.detach(ray.d)).to_world(mi.Vector3f(disk.x, disk.y, 0)) - ray.d
             ray.o = dr.select(_is_one_of(self.maps, emitter), mi.Point3f(box.center()) + start * radius, ray.o)
+        for each in self.spheres:
+            o, d = _from_sphere(each, ray.d, u.place)
+            here = emitter == mi.EmitterPtr(each)
+            ray.o, ray.d = dr.select(here, o, ray.o), dr.select(here, d, ray.d)
         if trace.traits.lights_deform:
             weight *= _growth(trace, emitter, ray, active)
         if self.rounded:
@@ -145,6 +152,27 @@ def _require_rays(emitter: mi.Emitter) -> None:
 def _has_smooth_mesh(emitter: mi.Emitter) -> bool:
     shape = emitter.get_shape()
     return shape is not None and is_mesh(shape) and compat.has_normals(shape)
+
+
+def _is_uniform_sphere(emitter: mi.Emitter) -> bool:
+    """Return whether Mitsuba samples origins uniformly on a sphere, as it does unless the radiance is textured."""
+    shape = emitter.get_shape()
+    textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+    return shape is not None and shape.class_name() == SPHERE and not textured
+
+
+def _from_sphere(emitter: mi.Emitter, d: mi.Vector3f, u: mi.Point2f) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Return origin and direction of a ray from a sphere, from the direction ``d`` that Mitsuba has sampled.
+
+    Mitsuba 3.9 does not apply the rotation of ``to_world`` to the normal at a sampled point, around which it samples
+    ``d``. The direction must be rotated, and the origin offset along the rotated normal.
+    """
+    to_world = mi.traverse(emitter.get_shape())["to_world"]
+    normal = mi.warp.square_to_uniform_sphere(u)
+    side = dr.select(dr.dot(normal, d) < 0, mi.Float(-1), 1)  # spheres with flipped normals emit to the inside
+    p, n = to_world @ mi.Point3f(normal), dr.normalize(to_world @ mi.Vector3f(normal))
+    offset = dr.detach(side * mi.math.RayEpsilon * (1 + dr.max(dr.abs(p))))
+    return p + n * offset, dr.normalize(to_world @ d)
 
 
 def _origin(
