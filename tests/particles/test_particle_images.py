@@ -133,6 +133,18 @@ def test_rotated_spheres_shine_as_unrotated_ones(angle: float, flips: bool) -> N
     assert both(f"sphere, {angle} degrees", scene, "pathreplay_particles", FEW, max_depth=2) < Z_LIMIT
 
 
+@pytest.mark.parametrize("light", ["directional", "constant", "envmap"])
+def test_infinite_emitters_reach_what_has_moved_out_of_the_scene(light: str) -> None:
+    """Mitsuba does not update the bounding sphere on which their light paths start."""
+    parts = room(light)
+    scene = mi.load_dict({**{key: parts[key] for key in ("type", "sensor", "light", "floor")}}, optimize=False)
+    params = mi.traverse(scene)
+    for factor in (1, 3):
+        params["floor.to_world"] = mi.Transform4f().scale(factor) @ mi.Transform4f(params["floor.to_world"])
+        params.update()
+        assert both(f"{light}, floor times {factor}", scene, "pathreplay_particles", FEW, max_depth=2) < Z_LIMIT
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("weights", [(1.0, 1.0, 1.0), (1.0, 0.3, 2.0), (0.0, 1.0, 1.0)])
 def test_light_paths_start_at_all_emitters(weights: tuple[float, float, float]) -> None:

@@ -18,6 +18,7 @@ from particle_scenes import HEIGHT, WIDTH, balls, dome, images, meter, panel, ro
 from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.cli import app
 from pathreplay.inverse.config.schema import make_config
+from pathreplay.inverse.loop.loop import new_run, take_step
 from pathreplay.inverse.problem.problem import build_problem
 from pathreplay.jobs import optimize
 from pathreplay.testing.statistics import gap
@@ -409,6 +410,36 @@ def test_recorded_steps_are_traced_steps(plugin: dict) -> None:
     config = job(plugin, iterations=4)
     made = build_problem(config, Path.cwd())
     np.testing.assert_allclose(steps(made, config, "recorded"), steps(made, config, "traced"), rtol=1e-4)
+
+
+INFINITE = {
+    "directional": '<vector name="direction" value="0.2,-1,0.1"/><rgb name="irradiance" value="3"/>',
+    "constant": '<rgb name="radiance" value="1"/>',
+    "envmap": '<string name="filename" value="sky.exr"/>',
+}
+
+
+@pytest.mark.parametrize("light", INFINITE)
+def test_recorded_steps_follow_the_bounds_of_the_scene(light: str) -> None:
+    """Light paths from infinite emitters start on the bounding sphere of the scene, which the ball changes here."""
+    mi.Bitmap(np.random.default_rng(0).random((4, 8, 3), np.float32)).write("sky.exr")
+    lamp = SCENE[SCENE.index("  <emitter") : SCENE.index("</scene>")]
+    text = SCENE.replace(lamp, f'  <emitter type="{light}" id="lamp">{INFINITE[light]}</emitter>\n').replace(
+        "dielectric", "diffuse"
+    )
+    ball = {"key": "ball.to_world", "pose": "translation", "initial": {"translation": [0, 0.3, 0]}}
+    config = job(PARTICLES, iterations=7, parameters=[ball], learning_rate=0.1)
+    Path("scene.xml").write_text(text.format(integrator=""))
+    made = build_problem(config, Path.cwd())
+    histories = []
+    for record in (True, False):
+        run = new_run(made, made.integrator, record=record)
+        for i in range(config.iterations):
+            take_step(made, run, i)
+        histories.append([[entry.loss, *entry.gradient_norms.values()] for entry in run.history])
+        made_anew = [each.n_recordings for each in run.executor.evaluate._recordings[config.spp]._frozen.values()]
+        assert sum(made_anew) < config.iterations - 1  # at least one step is replayed
+    np.testing.assert_allclose(*histories, rtol=1e-4)
 
 
 @pytest.mark.slow

@@ -217,6 +217,7 @@ class PathIntegrator:
             facts = facts_of(scene)
             if is_recording():
                 return PassState(facts.recorded_tables(self.tables, edges=False))
+            facts.enclose(scene)
             self.tables = facts.tables()
             return PassState(self.tables, facts.branches())
 

@@ -19,6 +19,7 @@ from pathreplay.transport.facts.traits import (
     blend_lengths,
     emitter_bounds,
     fixed_traits,
+    scene_bounds,
     smoothing_groups_of,
     tables_of,
 )
@@ -40,7 +41,10 @@ class SceneFacts:
         self._shapes = [node for node in nodes if isinstance(node, mi.Shape)]
         self._boxes = [shape.bbox() for shape in self._shapes]
         self._sizes = _sizes(self._shapes)
+        self._placed = scene.shapes()
         self._lights = scene.emitters()
+        self._infinite = [light for light in self._lights if mi.has_flag(light.flags(), mi.EmitterFlags.Infinite)]
+        self._box: mi.ScalarBoundingBox3f | None = None  # bounding box of the scene that infinite emitters know
         self._emitters = [*scene.emitters(), *(shape for shape in self._shapes if shape.is_emitter())]
         self._mesh_emitters = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
@@ -97,9 +101,10 @@ class SceneFacts:
         """Return the current lookup tables of BSDFs, shapes and emitters. Only changed tables are rebuilt."""
         boxes, sizes = [shape.bbox() for shape in self._shapes], _sizes(self._shapes)
         if self._tables is None:
-            self._tables = tables_of(self._traits.attachables, self._shapes, self._lights)
+            self._tables = tables_of(self._traits.attachables, self._shapes, self._lights, self._bounding_box())
         elif boxes != self._boxes:
-            self._tables = replace(self._tables, blend_lengths=blend_lengths(self._shapes))
+            lengths, sphere = blend_lengths(self._shapes), scene_bounds(self._bounding_box())
+            self._tables = replace(self._tables, blend_lengths=lengths, scene_bounds=sphere)
         if self._traits.mesh_lights:  # vertices may move without a change of the bounding box
             spheres = emitter_bounds(self._lights, self._shapes)
             if not np.array_equal(np.array(spheres), np.array(self._tables.emitter_bounds)):
@@ -118,7 +123,25 @@ class SceneFacts:
         """
         if known is not None and known is self._tables:
             return known
-        return tables_of(self._traits.attachables, self._shapes, self._lights, edges)
+        return tables_of(self._traits.attachables, self._shapes, self._lights, self._bounding_box(), edges)
+
+    def enclose(self, scene: mi.Scene) -> None:
+        """Update the bounding sphere of the scene that infinite emitters know.
+
+        Light paths from such emitters start on this sphere. Mitsuba 3.9 sets it when the scene is loaded, but not when
+        shapes move.
+        """
+        box = scene.bbox()
+        if self._infinite and box != self._box:
+            for light in self._infinite:
+                light.set_scene(scene)
+            self._box = box
+
+    def _bounding_box(self) -> mi.ScalarBoundingBox3f:
+        box = mi.ScalarBoundingBox3f()
+        for shape in self._placed:
+            box.expand(shape.bbox())
+        return box
 
 
 def _sizes(shapes: list[mi.Shape]) -> list[tuple[int, int]]:

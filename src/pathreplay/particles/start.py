@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -31,6 +30,7 @@ EMITTERS = frozenset(
 )
 MAP = "EnvironmentMapEmitter"
 SPHERE = "Sphere"
+SUN = "DirectionalEmitter"
 
 # Largest accepted distance between the origin of a ray and the triangle that emitted the ray. The unit is the distance
 # by which Mitsuba offsets origins along the normal. Only rays nearly parallel to the triangle have a larger distance.
@@ -61,6 +61,7 @@ class Emission:
     sensor: mi.Sensor  # its shutter determines the time of the rays
     weights: tuple[float, ...]  # relative probability of starting a path, for each emitter
     maps: tuple[mi.Emitter, ...]  # environment maps
+    suns: tuple[mi.Emitter, ...]  # directional emitters
     rounded: tuple[mi.Emitter, ...]  # emissive meshes with interpolated normals
     spheres: tuple[mi.Emitter, ...]  # emissive spheres whose origins Mitsuba samples uniformly
 
@@ -78,9 +79,9 @@ class Emission:
         for each, weight in zip(emitters, weights, strict=True):
             if weight > 0:
                 _require_rays(each)
-        maps = tuple(each for each in emitters if each.class_name() == MAP)
+        maps, suns = (tuple(each for each in emitters if each.class_name() == kind) for kind in (MAP, SUN))
         rounded, spheres = (tuple(filter(test, emitters)) for test in (_has_smooth_mesh, _is_uniform_sphere))
-        return Emission(scene, sensor, tuple(weights), maps, rounded, spheres)
+        return Emission(scene, sensor, tuple(weights), maps, suns, rounded, spheres)
 
     def pick(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Select an emitter; return its index, a random number independent of the index, and its probability."""
@@ -114,14 +115,18 @@ class Emission:
         emitter = dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index, active)
         time = mi.Float(self.sensor.shutter_open()) + u.time * self.sensor.shutter_open_time()
         ray, weight = emitter.sample_ray(time, again, u.place, u.direction, active)
+        sphere = dr.gather(mi.Vector4f, trace.traits.tables.scene_bounds, mi.UInt32(0))
+        center, radius = mi.Point3f(sphere.x, sphere.y, sphere.z), sphere.w
+        for each in self.suns:
+            o, power = _from_sun(each, center, radius, u.place, again)
+            here = emitter == mi.EmitterPtr(each)
+            ray.o, weight = dr.select(here, o, ray.o), dr.select(here, power, weight)
         if self.maps:
             # Mitsuba 3.9 samples origins on a disk that does not rotate with the environment map. Compute the origin
             # again.
-            box = self.scene.bbox()
-            radius = 0.5 * math.sqrt(sum(float(x) ** 2 for x in box.extents()))
             disk = mi.warp.square_to_uniform_disk_concentric(u.place)
             start = mi.Frame3f(dr.detach(ray.d)).to_world(mi.Vector3f(disk.x, disk.y, 0)) - ray.d
-            ray.o = dr.select(_is_one_of(self.maps, emitter), mi.Point3f(box.center()) + start * radius, ray.o)
+            ray.o = dr.select(_is_one_of(self.maps, emitter), center + start * radius, ray.o)
         for each in self.spheres:
             o, d = _from_sphere(each, ray.d, u.place)
             here = emitter == mi.EmitterPtr(each)
@@ -159,6 +164,19 @@ def _is_uniform_sphere(emitter: mi.Emitter) -> bool:
     shape = emitter.get_shape()
     textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
     return shape is not None and shape.class_name() == SPHERE and not textured
+
+
+def _from_sun(
+    emitter: mi.Emitter, center: mi.Point3f, radius: mi.Float, u: mi.Point2f, again: mi.Float
+) -> tuple[mi.Point3f, mi.Spectrum]:
+    """Return origin and weight of a ray from a directional emitter, for the bounding sphere of the scene.
+
+    Mitsuba 3.9 hides its own bounding sphere from Dr.Jit. A recorded pass would keep the sphere of the recording.
+    """
+    disk = mi.warp.square_to_uniform_disk_concentric(u)
+    offset = mi.traverse(emitter)["to_world"] @ mi.Vector3f(disk.x, disk.y, -1)
+    _, irradiance = emitter.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), again)
+    return center + offset * radius, irradiance * (dr.pi * dr.square(radius))
 
 
 def _from_sphere(emitter: mi.Emitter, d: mi.Vector3f, u: mi.Point2f) -> tuple[mi.Point3f, mi.Vector3f]:

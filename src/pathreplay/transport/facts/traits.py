@@ -54,6 +54,7 @@ class Tables:
     groups_at: mi.UInt32  # for each shape, the offset of its triangles in `groups`, or `WHOLE` or `FACETS`
     groups: mi.UInt32  # `smoothing_groups` of all meshes that have an offset, concatenated; entry 0 is unused
     emitter_bounds: mi.Float  # bounding sphere of each emitter: see `emitter_bounds`
+    scene_bounds: mi.Float  # bounding sphere of the scene: centre and radius
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,11 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
 
 
 def tables_of(
-    attachables: Iterable[mi.BSDF], shapes: list[mi.Shape], emitters: list[mi.Emitter], edges: bool = True
+    attachables: Iterable[mi.BSDF],
+    shapes: list[mi.Shape],
+    emitters: list[mi.Emitter],
+    box: mi.ScalarBoundingBox3f,
+    edges: bool = True,
 ) -> Tables:
     """Create the tables of a scene in its present state. Without ``edges``, omit the smoothing groups (long arrays)."""
     attachable = _by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)
@@ -137,6 +142,7 @@ def tables_of(
         blend_lengths(shapes),
         *(smoothing_groups_of(shapes) if edges else (mi.UInt32(WHOLE), mi.UInt32(0))),
         emitter_bounds(emitters, shapes),
+        scene_bounds(box),
     )
 
 
@@ -215,6 +221,14 @@ def emitter_bounds(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Flo
     meshes = {mesh.emitter(): mesh for mesh in _mesh_emitters(shapes)}
     spheres = [_bounding_sphere(meshes[emitter]) if emitter in meshes else np.zeros(4) for emitter in emitters]
     return _array(mi.Float, np.ravel(spheres or [np.zeros(4)]))  # an empty array would crash the process
+
+
+def scene_bounds(box: mi.ScalarBoundingBox3f) -> mi.Float:
+    """Return centre and radius of the smallest sphere around the bounding box of a scene; zeros for an empty scene."""
+    if not box.valid():
+        return _array(mi.Float, np.zeros(4))
+    extents = np.array([float(x) for x in box.extents()])
+    return _array(mi.Float, np.array([*(float(x) for x in box.center()), 0.5 * np.linalg.norm(extents)]))
 
 
 def _mesh_emitters(shapes: list[mi.Shape]) -> list[mi.Mesh]:
