@@ -168,6 +168,17 @@ def test_bitmaps_without_interpolation_are_found(filter: str, shape: tuple[int, 
     assert has_seams(node for node in nodes_of(body) if isinstance(node, mi.Texture)) is (filter == "nearest")
 
 
+@pytest.mark.parametrize("filter", ["bilinear", "nearest"])
+@pytest.mark.parametrize("kind", ["grey", "rows", "columns"])
+def test_bitmaps_without_interpolation_are_found_before_their_texels_differ(filter: str, kind: str) -> None:
+    """Facts about a scene are found at the first pass, when an optimised texture may still be constant."""
+    steps = np.arange(8, dtype=np.float32)[:, None, None] / 8
+    texels = {"grey": np.full((8, 8, 3), 0.5, np.float32), "rows": steps + np.zeros((8, 8, 3), np.float32)}
+    texels["columns"] = np.ascontiguousarray(texels["rows"].transpose(1, 0, 2))
+    painting = {"type": "bitmap", "raw": True, "data": mi.TensorXf(texels[kind]), "filter_type": filter}
+    assert has_seams([mi.load_dict(painting)]) is (filter == "nearest")
+
+
 def test_attributes_of_faces_have_seams_and_those_of_vertices_none() -> None:
     for name, seams in (("face_color", True), ("vertex_color", False)):
         assert has_seams([mi.load_dict({"type": "mesh_attribute", "name": name})]) is seams
