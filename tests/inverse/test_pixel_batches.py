@@ -48,6 +48,29 @@ def room(**film: Any) -> dict:
     return found
 
 
+def test_an_irradiance_meter_is_swept() -> None:
+    """Mitsuba's meter implements `sample_ray_differential` only."""
+    T = mi.ScalarTransform4f
+    pixel = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    sensor = {"type": "irradiancemeter", "film": pixel, "sampler": {"type": "independent"}}
+    grey = {"type": "diffuse", "reflectance": rgb(0.5, 0.5, 0.5)}
+    down = T().translate([0, 0, 2]).rotate([1, 0, 0], 180)
+    scene = mi.load_dict({
+        "type": "scene",
+        "plate": {"type": "rectangle", "to_world": down, "meter": sensor},
+        "lamp": {"type": "point", "position": [0, 0, 3], "intensity": rgb(9, 9, 9)},
+        "floor": {"type": "rectangle", "to_world": T().scale(4), "bsdf": grey},
+    })  # fmt: skip
+    params, key = mi.traverse(scene), "floor.bsdf.reflectance.value"
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    assert integrator.why_no_pixel_sweep(scene, spp=64) == ""
+    dr.enable_grad(params[key])
+    params.update()
+    one = mi.TensorXf(np.ones((1, 1, 3), np.float32))
+    image = np.array(integrator.render_value_and_grad(scene, one, 0 * one, spp=64))
+    assert image.min() > 0 and np.array(dr.grad(params[key])).ravel() == pytest.approx(image.ravel() / 0.5, rel=1e-3)
+
+
 def swept(bench: Bench, integrator: mi.Integrator, seed: int, count: int, offset: Any, slope: Any) -> tuple:
     """Of a batch of so many pixels: what they are, which, and what they say of the gradient by the case's t."""
     t = dr.opaque(mi.Float, 0)

@@ -39,7 +39,7 @@ def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) ->
     film, sampler = sensor.film(), sensor.sampler()
     film.prepare([])
     with dr.resume_grad():
-        ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
+        ray, _ = sensor.sample_ray_differential(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
     format, most = film.bitmap().pixel_format(), _largest_spp(max_depth)
     box = film.rfilter().is_box_filter()
     if not mi.is_rgb:
@@ -77,7 +77,9 @@ def pixel_camera(sensor: mi.Sensor, pixel: mi.UInt32) -> Callable[..., tuple[mi.
     def camera(sampler: mi.Sampler, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
         position = sample_position(sampler.next_2d(active)) / mi.Point2f(width, height)
         aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0)
-        return sensor.sample_ray(sensor.shutter_open(), 0.0, position, aperture, active)
+        # The meters of Mitsuba 3.9 do not implement `sample_ray`.
+        ray, weight = sensor.sample_ray_differential(sensor.shutter_open(), 0.0, position, aperture, active)
+        return mi.Ray3f(ray), weight
 
     return camera
 
