@@ -17,6 +17,7 @@ import pytest
 
 import particle_scenes
 from particle_scenes import balls, blocks, emitters, images, meter, perturbed, room, sensor
+from pathreplay.particles.film import ParticleFilm
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
 from truth import rgb
@@ -350,6 +351,16 @@ def test_caustics_of_lights_that_camera_paths_never_meet_are_there(light: str) -
     )
     assert compared(f"caustics: {light} and glass", ours, theirs) < Z_LIMIT
     assert without.mean() < 0.95 * ours.mean()
+
+
+def test_similar_filters_do_not_share_their_integrals() -> None:
+    """Mitsuba prints the standard deviations of gaussian filters with two digits."""
+    masses = []
+    for deviation in (0.0989, 0.1011):
+        filter = {"type": "gaussian", "stddev": deviation}
+        eye = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "rfilter": filter}})
+        masses.append(ParticleFilm.of(eye).mass)
+    assert masses[1] / masses[0] == pytest.approx((0.1011 / 0.0989) ** 2, rel=1e-3)
 
 
 def test_no_light_path_is_left_out_and_none_counts_twice() -> None:

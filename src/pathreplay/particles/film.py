@@ -58,12 +58,12 @@ class ParticleFilm:
                 "spectra; take an hdrfilm"
             )
         filter, (width, height) = film.rfilter(), film.crop_size()
-        name = str(filter)
-        if name not in _LENGTHS:
-            _LENGTHS[name] = _length(filter)
+        key = str(filter), float(filter.radius())
+        if key not in _LENGTHS:
+            _LENGTHS[key] = _length(filter)
         meter = sensor.class_name() == METER
         return ParticleFilm(
-            film, int(width), int(height), math.ceil(2 * float(filter.radius())), meter, _LENGTHS[name] ** 2
+            film, int(width), int(height), math.ceil(2 * float(filter.radius())), meter, _LENGTHS[key] ** 2
         )
 
     @property
@@ -143,9 +143,10 @@ class ParticleFilm:
         return buffer
 
 
-# Cache of the integrals of filters along one axis. The keys are the string representations of the filters. A pass that
-# `dr.freeze` records cannot compute the integrals.
-_LENGTHS: dict[str, float] = {}
+# Cache of the integrals of filters along one axis. A pass that `dr.freeze` records cannot compute the integrals. The
+# keys are the string representations and radii of the filters: the representation of a gaussian filter has only two
+# digits, but its radius is four standard deviations.
+_LENGTHS: dict[tuple[str, float], float] = {}
 
 
 def _length(filter: mi.ReconstructionFilter) -> float:
