@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import particle_scenes
-from particle_scenes import balls, blocks, emitters, images, meter, perturbed, room, sensor
+from particle_scenes import balls, blocks, emitters, images, meter, panel, perturbed, room, sensor
 from pathreplay.particles.film import ParticleFilm
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
@@ -328,6 +328,20 @@ def test_caustics_by_light_paths_complete_the_image(name: str) -> None:
 @pytest.mark.parametrize("name", CAUSTICS)
 def test_caustics_by_light_paths_complete_the_image_in_the_long_run(name: str) -> None:
     assert compare_caustics(name, MANY) < Z_LIMIT
+
+
+@pytest.mark.parametrize("plugin", [{"type": "pathreplay", "caustics": "particles"}, {"type": "pathreplay_particles"}])
+def test_lights_that_only_camera_paths_meet_by_chance_are_complete(plugin: dict) -> None:
+    """A weight of 0 excludes an area light from emitter sampling, but not from the image of `path`."""
+    lamp = panel(size=0.9)
+    lamp["emitter"]["sampling_weight"] = 0.0
+    sky = {"type": "constant", "radiance": 0.01}
+    look = mi.ScalarTransform4f().look_at([0, 1.2, -2.6], [0, 0, 0], [0, 1, 0])
+    glass = {"type": "sphere", "center": [0.2, 1.6, -0.1], "radius": 0.2, "bsdf": {"type": "dielectric"}}
+    scene = mi.load_dict({**balls(sky=sky, glass=glass, sensor=sensor(look=look)), "light": lamp})
+    options = dict(plugin)
+    z = both(f"area light of weight 0, {plugin}", scene, options.pop("type"), (8, 512), **options)
+    assert z < Z_LIMIT
 
 
 @pytest.mark.slow

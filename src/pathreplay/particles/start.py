@@ -73,7 +73,7 @@ class Emission:
         that cannot emit rays.
         """
         emitters = scene.emitters()
-        weights = [0.0 if caustics and each.is_environment() else each.sampling_weight() for each in emitters]
+        weights = [0.0 if caustics and each.is_environment() else _weight(each) for each in emitters]
         if not sum(weights) > 0:
             return None
         for each, weight in zip(emitters, weights, strict=True):
@@ -137,6 +137,18 @@ class Emission:
             rounded = active & _is_one_of(self.rounded, emitter)
             weight = dr.select(~rounded | _outwards(trace, emitter, ray, rounded), weight, 0)
         return ray, weight * dr.detach(reciprocal(probability))
+
+
+def _weight(emitter: mi.Emitter) -> float:
+    """Return the relative probability of starting light paths at an emitter.
+
+    Camera paths that hit an emitter find its light even if its ``sampling_weight`` is 0. Light paths only find the
+    light of an emitter at which they start.
+    """
+    flags, weight = emitter.flags(), emitter.sampling_weight()
+    directed = mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
+    found = emitter.is_environment() or (mi.has_flag(flags, mi.EmitterFlags.Surface) and not directed)
+    return weight if weight > 0 or not found else 1.0
 
 
 def _require_rays(emitter: mi.Emitter) -> None:
