@@ -139,7 +139,7 @@ def test_a_transparent_target_is_seen_over_black_and_that_is_told(
     target = read_image(result.folder / "images/target-cam.exr")
     assert target[:, :4] == pytest.approx(51 / 255, abs=1e-3) and target[:, 4:] == pytest.approx(1)
     picture(tmp_path, 255)
-    assert "transparent" not in run(PAINTED, images=["target.png"]).report.read_text()
+    assert "is transparent in" not in run(PAINTED, images=["target.png"]).report.read_text()
 
 
 def test_colours_of_exr_files_are_over_black_already() -> None:

@@ -15,11 +15,13 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from particle_scenes import ROUGH, dome, mirror, plane, slab
+from pathreplay.platform import compat
 from pathreplay.testing.objective import Move, Objective, smooth_weights
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.stencil import CENTRAL
@@ -320,3 +322,39 @@ def test_other_variants_have_the_same_gradients(run_python: Callable[..., Any], 
         assert error < SAME_SEED_MAX and transpose < TRANSPOSE_MAX, values
     for z, error in values["mean"]:
         assert abs(z) < Z_LIMIT and error < RESOLUTION, values
+
+
+def test_a_rectangle_light_grows_once() -> None:
+    """Whether or not a mesh light deforms: Mitsuba calls a rectangle a mesh, but differentiates its area."""
+    T, glow = mi.ScalarTransform4f(), {"type": "area", "radiance": 5.0}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T.scale(2)},
+            "panel": {
+                "type": "rectangle",
+                "to_world": T.translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(0.4),
+                "emitter": glow,
+            },
+            "box": {"type": "cube", "to_world": T.translate([3, 0, 2]).scale(0.2), "emitter": glow},
+            "eye": {
+                "type": "perspective",
+                "to_world": T.look_at([0, -4, 3], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgb"},
+            },
+        },
+        optimize=False,
+    )
+    params, found = mi.traverse(scene), []
+    first = mi.Transform4f(params["panel.to_world"])
+    integrator = mi.load_dict({"type": "pathreplay_particles", "max_depth": 2, "boundary": "none"})
+    for deforms in (False, True):
+        t = mi.Float(0)
+        dr.enable_grad(t)
+        params["panel.to_world"] = first @ mi.Transform4f().scale(1 + t)
+        if deforms:
+            dr.enable_grad(params[f"box.{compat.positions_name()}"])
+        params.update()
+        dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=64, seed=1), axis=None))
+        found.append(np.array(dr.grad(t))[0])
+    assert found[0] > 0 and found[1] == pytest.approx(found[0], rel=1e-3)

@@ -221,9 +221,11 @@ def _origin(
 def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
     """Return the factor A / A_0, where A is the area of the emitting triangle and A_0 is its detached value.
 
-    The factor is 1, but its derivative is the derivative of log A, which Mitsuba's `sample_ray` omits.
+    The factor is 1, but its derivative is the derivative of log A, which Mitsuba's `sample_ray` omits. Mitsuba counts
+    rectangles as meshes, but differentiates their area.
     """
     hit, back, on_mesh = _origin(trace, emitter, ray, active)
+    on_mesh &= hit.shape.shape_type() != int(mi.ShapeType.Rectangle)
     area = dr.norm(surface_point(hit, back, on_mesh).A)
     return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)
 
