@@ -25,7 +25,13 @@ from pathreplay.transport.start import CameraStart, behind_emitters
 from pathreplay.transport.surface import met
 from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, is_smooth
 from pathreplay.transport.volume.media import carried, span
-from pathreplay.transport.volume.passage import further, skip_null, transmittance_past_edge, transmittance_up_to
+from pathreplay.transport.volume.passage import (
+    further,
+    is_boundary,
+    skip_null,
+    transmittance_past_edge,
+    transmittance_up_to,
+)
 
 NEAR = 10.0
 """Smallest usable distance of an edge, in units of the offset of ray origins. The offset then turns a ray by at most
@@ -276,9 +282,16 @@ class ObserverVertex:
 
 
 def arrival_beyond(trace: TraceConfig, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
-    """Continue the ray of ``at`` from distance ``t`` on, inside ``medium``; return the `Arrival` at the next hit."""
-    ray = further(at.ray, t)
+    """Continue the ray of ``at`` from distance ``t`` on, inside ``medium``; return the `Arrival` at the next hit.
+
+    The next hit is a null boundary, or the hit of ``at``. A new search would not always find the latter: rounding moves
+    the rest of a ray sideways, and two rays that enclose an edge may then meet the same surface.
+    """
+    ray, known = further(at.ray, t), mi.PreliminaryIntersection3f(at.hit)
+    known.t -= t
     hit = meet(trace, ray, active)
     if trace.hide_emitters:
         hit = behind_emitters(trace, ray, hit, active & at.camera)
-    return Arrival(ray, hit, at.pdf, at.delta, at.camera, medium, t)
+    ahead = is_boundary(trace, hit, ray, active) & (hit.t < known.t)
+    behind = (known.t <= 0) | is_boundary(trace, at.hit, at.ray, active)
+    return Arrival(ray, dr.select(ahead | behind, hit, known), at.pdf, at.delta, at.camera, medium, t)

@@ -29,19 +29,20 @@ def skip_null(
 ) -> mi.PreliminaryIntersection3f:
     """Return the first hit that is not on a null boundary. Its distance is measured from the origin of ``ray``."""
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
-    passing = active & _is_boundary(trace, here, ray, active)
+    passing = active & is_boundary(trace, here, ray, active)
     while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond null boundaries"):
         # The new origin stays on the ray. `spawn_ray` would move the origin sideways.
         gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
         onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
         here = meet(trace, onward, passing)
         t = gone + here.t
-        passing &= _is_boundary(trace, here, onward, passing)
+        passing &= is_boundary(trace, here, onward, passing)
     here.t = t
     return here
 
 
-def _is_boundary(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+def is_boundary(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+    """Return whether a hit is on a null boundary."""
     return hit.is_valid() & is_null(shape_met(trace, hit, ray, active).bsdf())
 
 
