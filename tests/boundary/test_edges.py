@@ -25,6 +25,7 @@ from pathreplay.boundary.volumetric import VolumetricSearch
 from pathreplay.integrators.boundary_term import INNER_LENGTHS
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
+from pathreplay.integrators.lifetimes import careful
 from pathreplay.integrators.scene_facts import SceneFacts
 from pathreplay.platform.threads import one_thread
 from pathreplay.samplers.counter_sampler import ROUNDS, CounterSampler, key_of, quasi_random
@@ -293,12 +294,12 @@ def test_a_medium_out_of_view_takes_no_edges_from_a_large_film() -> None:
     aside = {"type": "cube", "to_world": scenes.T().translate([5, 0, -3]), "bsdf": {"type": "null"}, "interior": fog}
     eye = camera((0, 0, 5), 40)
     eye["film"] = {**eye["film"], "width": 256, "height": 256}
-    weights = []
-    for parts in ({}, {"aside": aside}):
-        scene = mi.load_dict({"type": "scene", "eye": eye, "card": card, "sky": {"type": "constant"}, **parts})
-        view = Pass.of(scene, 0, 0, 1)
-        trace = mi.load_dict({"type": "pathreplay", "max_depth": 3})._trace_config(scene, view.sensor)
-        with dr.suspend_grad():
+    weights, integrator = [], mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    worlds = [{"type": "scene", "eye": eye, "card": card, "sky": {"type": "constant"}, **p} for p in ({}, {"a": aside})]
+    for scene in [mi.load_dict(each) for each in worlds]:  # both stay alive
+        with careful(), dr.suspend_grad():
+            view = Pass.of(scene, 0, 0, 1)
+            trace = integrator._trace_config(scene, view.sensor)
             edges = PrimarySearch.of(trace, FilmPlaces.of(view), 0.5).find(2**16, 8000, mi.UInt32(1))
         weights.append(np.abs(np.array(edges.crossings[0].weight)[0]))
     # Of the edges, 5 % had no weight, because both rays met the same surface. Threads add in varying order, so that the
@@ -397,7 +398,7 @@ def test_beams_have_edges_where_they_are_seen(depth: int, by_chance: bool, dark:
     scene = mi.load_dict(media.shadow_in_fog(media.point, **(media.BY_CHANCE if by_chance else {}))())
     view = Pass.of(scene, 0, 0, 1)
     trace = mi.load_dict({"type": "pathreplay", "max_depth": depth})._trace_config(scene, view.sensor)
-    with dr.suspend_grad():
+    with careful(), dr.suspend_grad():
         edges = VolumetricSearch.of(trace, FilmPlaces.of(view), 0.5).find(2000, 200, mi.UInt32(1))
         weight = np.abs(edges.crossings[0].weight).sum()
     assert (weight == 0) == dark
