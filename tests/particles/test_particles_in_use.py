@@ -439,7 +439,8 @@ def test_recorded_steps_follow_the_bounds_of_the_scene(light: str) -> None:
         histories.append([[entry.loss, *entry.gradient_norms.values()] for entry in run.history])
         made_anew = [each.n_recordings for each in run.executor.evaluate._recordings[config.spp]._frozen.values()]
         assert sum(made_anew) < config.iterations - 1  # at least one step is replayed
-    np.testing.assert_allclose(*histories, rtol=1e-4)
+    # Threads add in varying order, which shows in gradients near the minimum, a thousandth of the first one.
+    np.testing.assert_allclose(*histories, rtol=1e-4, atol=1e-5 * histories[0][0][1])
 
 
 @pytest.mark.slow
