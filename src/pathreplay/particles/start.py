@@ -10,9 +10,9 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
+from pathreplay.transport.emitters import area_growth
 from pathreplay.transport.facts.nodes import is_mesh
 from pathreplay.transport.meet import meet
-from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import Arrival, TraceConfig, reciprocal
 
 #: Classes of emitters that can emit rays.
@@ -132,7 +132,8 @@ class Emission:
             here = emitter == mi.EmitterPtr(each)
             ray.o, ray.d = dr.select(here, o, ray.o), dr.select(here, d, ray.d)
         if trace.traits.lights_deform:
-            weight *= _growth(trace, emitter, ray, active)
+            # Mitsuba's `sample_ray` omits the derivative of the areas of triangles.
+            weight *= area_growth(*_origin(trace, emitter, ray, active))
         if self.rounded:
             rounded = active & _is_one_of(self.rounded, emitter)
             weight = dr.select(~rounded | _outwards(trace, emitter, ray, rounded), weight, 0)
@@ -216,18 +217,6 @@ def _origin(
     back.d = -back.d
     hit = trace.scene.ray_intersect_preliminary(back, active=active)
     return hit, back, active & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == emitter)
-
-
-def _growth(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-    """Return the factor A / A_0, where A is the area of the emitting triangle and A_0 is its detached value.
-
-    The factor is 1, but its derivative is the derivative of log A, which Mitsuba's `sample_ray` omits. Mitsuba counts
-    rectangles as meshes, but differentiates their area.
-    """
-    hit, back, on_mesh = _origin(trace, emitter, ray, active)
-    on_mesh &= hit.shape.shape_type() != int(mi.ShapeType.Rectangle)
-    area = dr.norm(surface_point(hit, back, on_mesh).A)
-    return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)
 
 
 def _outwards(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:

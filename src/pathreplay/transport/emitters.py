@@ -124,13 +124,21 @@ def _at_fixed_point(
 def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:
     """Return a factor of value 1, whose derivative is the derivative of the log area of the sampled triangle.
 
-    The factor is needed because Mitsuba samples a mesh with the triangle areas at load time, without derivatives. It is
-    1 on a rectangle, which Mitsuba counts as a mesh, but whose area it differentiates.
+    The factor is needed because Mitsuba samples a mesh with the triangle areas at load time, without derivatives.
     """
     ray = dr.detach(origin.spawn_ray_to(light.p))
     ray.maxt = dr.largest(mi.Float)
     hit = scene.ray_intersect_preliminary(ray, active=lit)
     on_mesh = lit & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == light.emitter)
-    on_mesh &= hit.shape.shape_type() != int(mi.ShapeType.Rectangle)
+    return area_growth(hit, ray, on_mesh)
+
+
+def area_growth(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, on_mesh: mi.Bool) -> mi.Float:
+    """Return the factor A / A_0, where A is the area of the triangle at a hit, and A_0 is its detached value.
+
+    The factor is 1, but its derivative is the derivative of log A. It is constant off meshes, and on rectangles, which
+    Mitsuba counts as meshes, but whose area it differentiates.
+    """
+    on_mesh = on_mesh & (hit.shape.shape_type() != int(mi.ShapeType.Rectangle))
     area = dr.norm(surface_point(hit, ray, on_mesh).A)
     return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)

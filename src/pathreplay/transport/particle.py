@@ -14,6 +14,7 @@ from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport import arrive, scatter
 from pathreplay.transport.meet import meet
 from pathreplay.transport.sensor import SensorLink, Sighting
+from pathreplay.transport.start import behind_emitters
 from pathreplay.transport.surface import normal_in_frame
 from pathreplay.transport.vertex import (
     Arrival,
@@ -26,7 +27,6 @@ from pathreplay.transport.vertex import (
     VertexSamples,
     is_smooth,
 )
-from pathreplay.transport.volume.passage import STEP
 
 
 def choose_step(
@@ -89,30 +89,10 @@ def _unoccluded(trace: TraceConfig, v: arrive.Vertex, to: Sighting, active: mi.B
     ray = v.origin.spawn_ray_to(to.end)
     if not (trace.hide_emitters and trace.traits.area_lights):
         return ~trace.scene.ray_test(ray, active)
-    active = active & ~_on_emitter(v.si.shape)
-    return active & ~_occluded(trace, ray, active)
-
-
-@dr.syntax
-def _occluded(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-    """Return whether a surface other than an area emitter occludes the ray up to its ``maxt``.
-
-    Mitsuba's `skip_area_emitters` does not keep ``maxt``, and would also find surfaces behind the sensor.
-    """
-    onward, occluded, passing = mi.Ray3f(ray), mi.Bool(False), mi.Bool(active)
-    while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond hidden emitters"):
-        hit = meet(trace, onward, passing)
-        passing &= hit.is_valid()
-        hidden = _on_emitter(hit.shape)
-        occluded |= passing & ~hidden
-        passing &= hidden
-        step = hit.t + STEP * (1 + dr.max(dr.abs(onward.o)) + hit.t)
-        onward.o, onward.maxt = onward.o + step * ray.d, onward.maxt - step
-    return occluded
-
-
-def _on_emitter(shape: mi.ShapePtr) -> mi.Bool:
-    return shape.emitter() != None  # noqa: E711 (an array of pointers)
+    active = active & (v.si.shape.emitter() == None)  # noqa: E711 (an array of pointers)
+    # Behind an emitter, the search continues past the sensor; what it finds there occludes nothing.
+    hit = behind_emitters(trace, ray, meet(trace, ray, active), active)
+    return active & ~(hit.is_valid() & (hit.t < ray.maxt))
 
 
 def _weighted(link: SensorLink, splat: Splat, at: Arrival, lit: mi.Bool) -> mi.Spectrum:

@@ -17,10 +17,10 @@ from pathreplay.transport.volume.shadow import Stretch, shadow, transmittance
 
 SHORT_OF = 1 - 1e-3
 """The transmittance up to this fraction of the distance to an edge is estimated once for the rays on both sides. The
-value is slightly below 1, so that the remaining parts of both rays still intersect the surfaces at the edge."""
+value is slightly below 1, so that the surfaces at the edge are at positive distances on the remaining parts of both
+rays."""
 STEP = 1e-5
-"""Offset behind a null boundary or a hidden emitter at which the next ray starts, relative to distance and
-coordinates."""
+"""Offset behind a null boundary at which the next ray starts, relative to distance and coordinates."""
 
 
 @dr.syntax
