@@ -401,7 +401,7 @@ def test_stages_take_the_place_of_steps(photos: list[np.ndarray]) -> None:
 
 @pytest.mark.parametrize("key", [TEXTURE, "floor.*.data"])
 def test_grids_are_refined_at_the_stages_of_the_minimisation(key: str, photos: list[np.ndarray]) -> None:
-    """Not at those of the problem, which stay what they are."""
+    """The stages of the problem do not count, and are not changed."""
     own = [{"iterations": 1}, {"iterations": 4}]
     problem = Problem(room(), {key: Parameter(resolutions=[2, 4])}, views(photos), spp=2, stages=own)
 

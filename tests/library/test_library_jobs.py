@@ -120,7 +120,7 @@ def test_targets_of_files_and_masks_go_along(place: Path) -> None:
 
 
 def test_captures_of_several_jobs_are_joint(place: Path) -> None:
-    """Cameras and images are those of each capture."""
+    """Each part of the joint problem has the cameras and images of its own capture."""
     camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
     for n in (0, 1):
         (place / f"photo{n}.exr").write_bytes(exr_bytes(np.full((4, 6, 3), 0.2 + 0.2 * n, np.float32)))

@@ -27,7 +27,7 @@ DEEPEST = 8
 """Deepest nesting of lists in a return value."""
 
 _IMPORTS = threading.RLock()
-"""Held while `sys.path` and `sys.modules` are those of one job."""
+"""Lock that is held while `sys.path` and `sys.modules` contain the folder and the modules of one job."""
 
 
 @dataclass(frozen=True, eq=False)  # the function may be an object without a hash
@@ -116,7 +116,7 @@ class Modules:
             return sys.modules[root] if root == name else importlib.import_module(name)
 
     def _place(self, name: str) -> tuple[str, Path | None]:
-        """Return the outermost package of a module, and its file in the folder ``base``, or None if there is none."""
+        """Return the outermost package of a module, and its file, or None if the folder ``base`` does not have it."""
         package = _root(name)
         if self._base is not None:
             if (file := self._base / f"{name}.py").is_file():

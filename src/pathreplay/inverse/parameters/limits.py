@@ -16,8 +16,8 @@ from pathreplay.inverse.parameters.values import Array
 from pathreplay.platform import memory
 
 # Bytes per optimised number, for eight floats: the old value, the new value, the copy in Dr.Jit, the gradient, the sum
-# of gradients, Adam's two moments and a temporary. The means of iterate averaging are not counted, because larger
-# variables have none.
+# of gradients, Adam's two moments and a temporary. The means of iterate averaging are not counted, because large
+# variables are not averaged.
 _A_VALUE = 32
 # Largest ratio of a learning rate to the values. The learning rate is about the length of Adam's steps.
 _LONGEST_STEP = 1e6
