@@ -399,6 +399,15 @@ def test_stages_take_the_place_of_steps(photos: list[np.ndarray]) -> None:
     assert len(again.history) == 3 and "3 iterations" in repr(again) and WALL in repr(problem)
 
 
+def test_l2_to_initial_of_a_refined_grid_has_the_details_of_its_initial_value(photos: list[np.ndarray]) -> None:
+    detailed = np.random.default_rng(3).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32)
+    entry = Parameter(initial=detailed, resolutions=[2, 4], refine_at=[1], l2_to_initial=1.0)
+    (variable,) = Problem(room(), {TEXTURE: entry}, views(photos), spp=1).built.variables
+    assert variable.start.shape == (2, 2, 3)
+    assert variable.penalty.of(variable.start)[0] == 0
+    assert variable.penalty.of(detailed)[0] == 0
+
+
 @pytest.mark.parametrize("key", [TEXTURE, "floor.*.data"])
 def test_grids_are_refined_at_the_stages_of_the_minimisation(key: str, photos: list[np.ndarray]) -> None:
     """The stages of the problem do not count, and are not changed."""

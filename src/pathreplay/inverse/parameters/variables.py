@@ -190,11 +190,11 @@ def make_variables(
             else:
                 assert coordinates is not None
                 bounded(key, rate, coordinates.latent(start))
+            penalty = _penalty(params, key, entry, start, levels, modules)
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
             if dr.is_tensor_v(like):
                 like = dr.zeros(type(like), start.shape)  # literal zeros, which take no memory
-            penalty = _penalty(params, key, entry, start, levels, modules)
             variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
             continue
         parameter_limits.require_near(scene, key, parameters.get_array(params[key]), entry)
