@@ -148,7 +148,8 @@ class ObserverVertex:
         a, b = span(self.at.medium, ray, dr.select(si.is_valid(), si.t, dr.inf), self.event)
         t, _ = carried(self.flight.t, a, b, self.event)
         origin = mi.Interaction3f(self.origin)
-        origin.p, origin.n = dr.select(self.event, ray.o + t * ray.d, si.p), si.n
+        origin.p = dr.select(self.event, ray.o + t * ray.d, si.p)
+        origin.n = dr.select(self.event, 0, si.n)
         return origin
 
     def towards(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:

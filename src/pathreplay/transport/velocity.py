@@ -6,21 +6,27 @@ V(d), if the weight contains a factor J with (log J)' = div V. The prime denotes
 parameter. Two simple fields are
 
     V_H    d points to y, which moves with its surface: J_H = |A·d| / r², with A the area element at y
-    0      d is constant
+    V_D    d rotates as the normal at x does, about an axis perpendicular to this normal: J_D = 1
 
 With V_H, the edges of emitters and the seams between materials have fixed positions in the integrand. With other
-fields, the motion of edges and seams is a boundary term, which the interior term does not contain. However, let h be
-the distance from x to the plane of y. If x moves parallel to this plane, (log J_H)' grows like 1/h, and the variance is
-infinite wherever two surfaces touch. The field used here is therefore the blend V = φ V_H, with φ = 1 - exp(-m),
-m = h r / h0² and the length h0 of `blend_length`:
+fields, the motion of edges and seams is a boundary term, which the interior term does not contain. However, V_H has
+infinite variance wherever two surfaces touch. Let h be the distance from x to the plane of y, and k the distance from y
+to the plane of x. If x moves parallel to the plane of y, (log J_H)' grows like 1/h. If y moves perpendicular to the
+plane of x, the relative derivative of the cosine at x grows like 1/k. With V_D, this cosine is constant. The field used
+here is therefore a blend, with the length h0 of `blend_length`:
 
-    (log J)' = φ (log J_H)' + ∇φ·V_H,        ∇φ·V_H = -m exp(-m) (n·d_H') / (n·d)
+    V = φ V_H + (1 - φ) V_D,    φ = (1 - exp(-m)) (1 - exp(-q)),    m = h r / h0²,    q = k / h0
+    (log J)' = φ (log J_H)' + ∇φ·(V_H - V_D)
 
-Here n is the normal of the plane, and d_H the direction to y. In ∇φ, only r depends on d, because all directions that
-hit the plane have the same h. The factor r in m keeps V close to V_H at distant hit points on a near plane. Such points
-may lie on edges. The cost in variance is small, because only a few directions, all at grazing angles, reach such
-points. For a sphere, h is the distance from x to the sphere, which is also independent of d. This distance does not
-vanish at the silhouette. On other curved shapes, V = V_H.
+Let n be the normal at y, and n_x the normal at x with n_x·d > 0. All directions that hit the plane of y have the same
+h, but different r and k. For a change δd of the direction,
+
+    ∇m·δd = -m (n·δd) / (n·d),    ∇q·δd = (r n_x·δd - k (n·δd) / (n·d)) / h0
+
+The factor r in m keeps V close to V_H at distant hit points on a near plane. Such points may lie on edges. The cost in
+variance is small, because only a few directions, all at grazing angles, reach such points. For a sphere, h is the
+distance from x to the sphere, which is also independent of d. This distance does not vanish at the silhouette. On other
+curved shapes, m is infinite. If x is in a medium, it has no normal: q is infinite, and V_D = 0.
 """
 
 from __future__ import annotations
@@ -66,9 +72,11 @@ def moved_direction(
     log_J_H = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
 
     h0 = dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, hit.shape), ok)
-    φ, slope = _share(h0, dr.detach(y), dr.detach(towards), ok)
-    log_J = φ * log_J_H + dr.dot(slope, d_H)
-    return dr.select(ok, dr.replace_grad(d, φ * d_H), d), dr.replace_grad(mi.Float(1), log_J)
+    n_x = dr.detach(origin.n)
+    d_D = dr.cross(dr.cross(n_x, origin.n), dr.detach(d))  # its derivative is V_D
+    φ, slope = _share(h0, dr.detach(y), n_x, dr.detach(towards), ok)
+    log_J = φ * log_J_H + dr.dot(slope, d_H - d_D)
+    return dr.select(ok, dr.replace_grad(d, φ * d_H + (1 - φ) * d_D), d), dr.replace_grad(mi.Float(1), log_J)
 
 
 def jumps_at_facets(
@@ -97,11 +105,12 @@ def held_direction(
     return dr.select(ok, dr.replace_grad(d, dr.normalize(towards)), d)
 
 
-def _share(h0: mi.Float, y: SurfacePoint, towards: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Vector3f]:
-    """Compute the blend factor φ, and a vector ``slope`` with ∇φ·V_H = slope·d_H'. Both results are detached.
+def _share(
+    h0: mi.Float, y: SurfacePoint, n_x: mi.Normal3f, towards: mi.Vector3f, active: mi.Bool
+) -> tuple[mi.Float, mi.Vector3f]:
+    """Compute the blend factor φ and its gradient ∇φ with respect to the direction (see the module docstring).
 
-    V_H is the velocity field of directions that follow the hit point y. d_H' is the derivative of the direction from x
-    to y with respect to the parameters. ``towards`` is y - x.
+    ``n_x`` is the normal at x, or zero, and ``towards`` is y - x. All inputs and results are detached.
     """
     r = dr.norm(towards)
     n = dr.normalize(y.A)
@@ -113,6 +122,13 @@ def _share(h0: mi.Float, y: SurfacePoint, towards: mi.Vector3f, active: mi.Bool)
     # For κ = 0, h is the distance to the plane.
     h = (κ * r * r - 2 * dr.dot(n, towards)) / (1 + dr.norm(n - κ * towards))
     m = dr.maximum(h, 0) * r / dr.square(h0)
-    steep = m * dr.exp(-m) * r / dr.dot(n, towards)
-    slope = dr.select(blends & dr.isfinite(steep), -steep * n, 0)
-    return dr.select(blends, 1 - dr.exp(-m), 1), slope
+    inv_cos = r / dr.dot(n, towards)
+    steep = m * dr.exp(-m) * inv_cos
+    φ, slope = dr.select(blends, 1 - dr.exp(-m), 1), dr.select(blends & dr.isfinite(steep), -steep * n, 0)
+
+    k = dr.dot(n_x, towards)
+    q = dr.abs(k) / h0
+    steep_x = φ * dr.exp(-q) * dr.sign(k) * (r * mi.Vector3f(n_x) - k * inv_cos * n) / h0
+    blends = active & (h0 > 0) & (dr.squared_norm(n_x) > 0) & dr.isfinite(inv_cos)
+    φ_x = dr.select(blends, 1 - dr.exp(-q), 1)
+    return φ * φ_x, φ_x * slope + dr.select(blends, steep_x, 0)
