@@ -94,6 +94,42 @@ def test_tabulated_extinction_differs_between_wavelengths(run_python: Callable[.
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+# A coloured mirror makes the throughput small where the extinction is small. For the red spectrum below, Mitsuba's
+# majorant is 0.6, and the extinction reaches 1.
+COLOURED = """
+import sys
+from pathreplay.platform.backend import set_variant
+set_variant(sys.argv[1])
+import mitsuba as mi, numpy as np
+T, red = mi.ScalarTransform4f, {"type": "rgb", "value": [0.9, 0.02, 0.02]}
+
+def behind_mirror(kind, sigma_t):
+    metal = {"type": "conductor", "material": "none", "specular_reflectance": dict(red)}
+    to_mirror = T().translate([0, 0, 4]).scale(0.5).rotate([0, 1, 0], 180)
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}
+    medium = {"type": kind, "sigma_t": sigma_t, "albedo": 0.0}
+    to_camera = T().look_at([0, 0, 1.5], [0, 0, 4], [0, 1, 0])
+    scene = mi.load_dict({
+        "type": "scene",
+        "sky": {"type": "constant"},
+        "mirror": {"type": "rectangle", "to_world": to_mirror, "bsdf": metal},
+        "box": {"type": "cube", "bsdf": {"type": "null"}, "interior": medium},
+        "sensor": {"type": "perspective", "fov": 3, "to_world": to_camera, "film": film},
+    })
+    return np.mean(mi.render(scene, integrator=mi.load_dict({"type": "pathreplay"}), spp=256), axis=(0, 1))
+
+volume = {"type": "constvolume", "value": dict(red), "to_world": T().translate(-1).scale(2)}
+found = behind_mirror("heterogeneous", volume)
+expected = behind_mirror("homogeneous", dict(red))
+assert np.allclose(found, expected, rtol=0.05), (found, expected)
+"""
+
+
+def test_coloured_extinction_may_exceed_the_majorant_of_mitsuba(run_python: Callable[..., Any]) -> None:
+    done = run_python(COLOURED, args=(SPECTRAL_VARIANT,))
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def deep(kind: str) -> tuple[dict, str]:
     """A cube of side 2 with an optical depth of a hundred and more, whose transmittance is not representable."""
     if kind == "homogeneous":

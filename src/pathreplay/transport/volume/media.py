@@ -139,8 +139,17 @@ def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.F
 
 
 def majorant(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-    """Return an upper bound of the extinction in all channels and everywhere in the medium. Detached."""
-    return dr.max(dr.detach(medium.get_majorant(interaction(medium, dr.detach(ray), mi.Float(0)), active)))
+    """Return an upper bound of the extinction in all channels and everywhere in the medium. Detached.
+
+    In spectral variants, Mitsuba takes the mean of a colour's spectrum for its maximum. A `heterogeneous` medium whose
+    extinction is a colour then has a majorant below its extinction at some wavelengths. The extinction of such a medium
+    is the same at all points, so its value at the ray's origin is a bound.
+    """
+    mei = interaction(medium, dr.detach(ray), mi.Float(0))
+    bound = dr.max(dr.detach(medium.get_majorant(mei, active)))
+    if mi.is_spectral:
+        bound = dr.fmax(bound, dr.max(dr.detach(medium.get_scattering_coefficients(mei, active)[2])))
+    return bound
 
 
 def is_grid(grid: Grid, medium: mi.MediumPtr) -> mi.Bool:
