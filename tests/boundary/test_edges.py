@@ -99,7 +99,7 @@ def test_centres_are_drawn_with_their_density() -> None:
     seen = mi.Point2f(2.0, 1.0) + 0 * mi.Float(rng.random(50))
     centres = even.refined(seen, mi.Float(1))
     n = 200000
-    c, density = centres.draw(mi.Point2f(rng.random((2, n), np.float32)))
+    c, density = centres.draw(*mi.Point2f(rng.random((2, n), np.float32)))
     corner = c + centres.margin
     pixel = np.array(mi.UInt32(corner.y) * centres.width + mi.UInt32(corner.x))
     counts = np.bincount(pixel, minlength=centres.width * centres.height) / n
@@ -110,6 +110,18 @@ def test_centres_are_drawn_with_their_density() -> None:
     assert counts.argmax() == centres.width + 2
     # 1 / density is an unbiased estimate of the area.
     assert np.mean(1 / np.array(density)) == pytest.approx(centres.width * centres.height, rel=0.01)
+
+
+def test_centres_reach_all_pixels_of_a_large_film() -> None:
+    """Single precision gives most pixels of such a film the probability 0, and some a negative one."""
+    even = SegmentDensity.uniform(mi.ScalarVector2f(4096, 4096), 0.5)
+    centres = even.refined(mi.Point2f(2000.0, dr.linspace(mi.Float, 1000, 3000, 2000)), mi.Float(1))
+    n = 2**18
+    c, density = centres.draw(*quasi_random(dr.arange(mi.UInt32, n), n, mi.UInt32(1)))
+    assert dr.all(density > 0)
+    below = np.where(np.array(c.y) > 3500, 1 / np.array(density), 0).mean()  # an estimate of an area
+    assert below == pytest.approx(4098 * (4097.5 - 3500), rel=0.05)
+    assert np.mean(np.array(c.x) % 1) == pytest.approx(0.5, abs=0.01)
 
 
 def sight(signature: int, p: list[float], n: list[float]) -> VisibilityProbe:
@@ -230,7 +242,7 @@ def test_one_line_of_one_pixel_finds_its_place() -> None:
     """As a meter of light has it: Dr.Jit gives numbers in place of arrays where tables have one entry."""
     (x, y), one = quasi_random(mi.UInt32(0), 1, mi.UInt32(5)), dr.ones(mi.Float, 1)
     assert 0 <= x[0] < 1 and 0 <= y[0] < 1
-    place, density = SegmentDensity(1, 1, 0.0).refined(mi.Point2f(0.5), one).draw(mi.Point2f(x, y))
+    place, density = SegmentDensity(1, 1, 0.0).refined(mi.Point2f(0.5), one).draw(x, y)
     assert dr.all((place >= 0) & (place < 1)) and dr.allclose(density, 1)
     picked = Resampled.of(one, 1, dr.opaque(mi.UInt32, 3))
     assert picked.index == 0 and picked.weight == 1

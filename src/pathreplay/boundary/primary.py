@@ -88,9 +88,9 @@ class PrimarySearch(FilmSearch[FilmSegment]):
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> FilmSegment:
         x, y, turn = quasi_random(i, n, seed, 3)
-        c, density = self.density.draw(mi.Point2f(x, y))
+        c, density = self.density.draw(x, y)
         key = key_of(i, Stream.PRIMARY_KEYS.of(seed))
-        return FilmSegment(c, heading(turn), mi.Float(self.length), key, density, mi.Bool(True))
+        return FilmSegment(c, heading(mi.Float(turn)), mi.Float(self.length), key, density, mi.Bool(True))
 
     def probe(self, segment: FilmSegment, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
         s = segment.at(t)

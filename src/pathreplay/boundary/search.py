@@ -157,7 +157,9 @@ class SegmentDensity:
     width: int
     height: int
     margin: float  # l, the length of segments
-    cdf: mi.Float | None = None  # cumulative probabilities of the pixels; None: uniform
+    # Cumulative probabilities of the pixels; None: uniform. In single precision, most pixels of a film with millions of
+    # pixels would have the probability 0.
+    cdf: mi.Float64 | None = None
 
     @staticmethod
     def uniform(size: mi.ScalarVector2f, l: float) -> SegmentDensity:
@@ -183,24 +185,27 @@ class SegmentDensity:
         total = dr.sum(counts)
         previous = self._probability(dr.arange(mi.UInt32, n))
         probability = dr.select(total > 0, dr.fma(counts, (1 - unrefined) / total, unrefined * previous), previous)
-        cdf = dr.cumsum(probability)
-        return SegmentDensity(self.width, self.height, self.margin, cdf / dr.gather(mi.Float, cdf, n - 1))
+        cdf = dr.cumsum(mi.Float64(probability))
+        return SegmentDensity(self.width, self.height, self.margin, cdf / dr.gather(mi.Float64, cdf, n - 1))
 
     def _probability(self, i: mi.UInt32) -> mi.Float:
         """Return the probability of a pixel."""
         if self.cdf is None:
             return mi.Float(1 / (self.width * self.height))
-        begin = dr.select(i > 0, dr.gather(mi.Float, self.cdf, i - 1, i > 0), 0)
-        return dr.gather(mi.Float, self.cdf, i) - begin
+        begin = dr.select(i > 0, dr.gather(mi.Float64, self.cdf, i - 1, i > 0), 0)
+        return mi.Float(dr.gather(mi.Float64, self.cdf, i) - begin)
 
-    def draw(self, u: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
-        """Sample a film position from random numbers in the unit square; return it with its density."""
+    def draw(self, x: mi.Float64 | mi.Float, y: mi.Float64 | mi.Float) -> tuple[mi.Point2f, mi.Float]:
+        """Sample a film position from random numbers in the unit square; return it with its density.
+
+        On large films, ``x`` must be a Float64, because it selects both a pixel and a position in this pixel.
+        """
         n = self.width * self.height
         if self.cdf is None:
-            return u * mi.Point2f(self.width, self.height) - self.margin, mi.Float(1 / n)
-        below = lambda i: dr.gather(mi.Float, self.cdf, i) <= u.x  # noqa: E731
+            return mi.Point2f(x, y) * mi.Point2f(self.width, self.height) - self.margin, mi.Float(1 / n)
+        below = lambda i: dr.gather(mi.Float64, self.cdf, i) <= x  # noqa: E731
         i = mi.UInt32(dr.minimum(dr.binary_search(0, n - 1, below), n - 1))  # converts a Python integer, if n is 1
         probability = self._probability(i)
-        begin = dr.gather(mi.Float, self.cdf, i) - probability
-        x = dr.clip((u.x - begin) / probability, 0, dr.one_minus_epsilon(mi.Float))
-        return mi.Point2f(mi.Float(i % self.width) + x, mi.Float(i // self.width) + u.y) - self.margin, probability
+        rest = mi.Float(dr.gather(mi.Float64, self.cdf, i) - x)
+        offset = mi.Point2f(dr.clip(1 - rest / probability, 0, dr.one_minus_epsilon(mi.Float)), y)
+        return mi.Point2f(mi.Float(i % self.width), mi.Float(i // self.width)) + offset - self.margin, probability

@@ -99,7 +99,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         """
         on_arc = i >= n
         i = dr.select(on_arc, i - n, i)
-        s, density = self.density.draw(mi.Point2f(quasi_random(i, n, seed)))
+        s, density = self.density.draw(*quasi_random(i, n, seed))
         return CameraPath(s, density, key_of(i, Stream.SECONDARY_KEYS.of(seed)), on_arc)
 
     def detect(self, segments: CameraPath) -> mi.Float:

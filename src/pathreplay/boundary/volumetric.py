@@ -76,7 +76,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         key = key_of(i, Stream.VOLUMETRIC_KEYS.of(seed))
         sampler = CounterSampler.stream(key, Stream.BEAM)
         w = heading(sampler.next_1d())
-        c, density = self.density.draw(mi.Point2f(quasi_random(i, n, Stream.VOLUMETRIC_CENTRES.of(seed))))
+        c, density = self.density.draw(*quasi_random(i, n, Stream.VOLUMETRIC_CENTRES.of(seed)))
         reach = self._reach(dr.detach(self.film.ray(c, key)[0]))
         τ = sampler.next_1d() * reach
         ok = dr.isfinite(reach) & (reach > 0)

@@ -62,11 +62,15 @@ def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     return mi.sample_tea_32(i, seed, ROUNDS)[0]
 
 
-def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32, dimensions: int = 2) -> list[mi.Float]:
-    """Return the i-th of n points of a randomly shifted Kronecker lattice, ordered by the first coordinate."""
+def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32, dimensions: int = 2) -> list[mi.Float | mi.Float64]:
+    """Return the i-th of n points of a randomly shifted Kronecker lattice, ordered by the first coordinate.
+
+    The first coordinate is a Float64 with 32 bits. The other coordinates have 24 bits.
+    """
     steps = [dr.opaque(mi.UInt32, 2**32 // n % 2**32), *map(mi.UInt32, STEPS)][:dimensions]
     shifts = [mi.sample_tea_32(seed, mi.UInt32(k + 1), ROUNDS)[0] for k in range(dimensions)]
-    return [_in_unit(i * step + shift) for step, shift in zip(steps, shifts, strict=True)]
+    first, *rest = [i * step + shift for step, shift in zip(steps, shifts, strict=True)]
+    return [mi.Float64(first) * 2**-32, *map(_in_unit, rest)]
 
 
 def _in_unit(x: mi.UInt32) -> mi.Float:
