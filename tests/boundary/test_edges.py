@@ -15,6 +15,7 @@ import pytest
 
 import edge_media_scenes as media
 import edge_scenes as scenes
+from edge_truth import loaded, ours
 from pathreplay.boundary.chains import transmittance_of_chain
 from pathreplay.boundary.crofton import BEYOND, BISECTIONS, PlaneSegment, VisibilityProbe, bisect, detect, heading
 from pathreplay.boundary.emitters import BORDER, sample_at
@@ -30,7 +31,7 @@ from pathreplay.integrators.scene_facts import SceneFacts
 from pathreplay.platform.threads import one_thread
 from pathreplay.samplers.counter_sampler import ROUNDS, CounterSampler, key_of, quasi_random
 from pathreplay.transport.facts.smoothing_groups import smoothing_groups
-from truth import camera
+from truth import bitmap, camera
 
 
 def world(**film: Any) -> mi.Scene:
@@ -337,6 +338,21 @@ def test_the_cone_around_a_mesh_lamp_follows_it() -> None:
     params[key] = mi.Float((vertices + 1).ravel())
     params.update()
     assert np.array(facts.tables().emitter_bounds) == pytest.approx([*(centre + 1), radius], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "place"), [("rectangle", scenes.OVERHEAD), ("sphere", scenes.T().translate([1.6, 1.2, 2.5]).scale(0.4))]
+)
+def test_the_texels_of_a_lamp_are_no_edges(kind: str, place: Any) -> None:
+    """Samples of a textured lamp jump from texel to texel. Its shadows move as those of a lamp without a texture."""
+    texels = {**bitmap(np.full((8, 8, 3), 5)), "filter_type": "bilinear"}
+    found = []
+    for radiance in (5.0, texels):
+        make = scenes.shadow(light=partial(scenes.lamp, place, radiance, kind))
+        case = scenes.cell("lamp", make, scenes.OBJECT, scenes.translate(*scenes.ASIDE))
+        with loaded(case) as bench:
+            found.append(np.mean([bench.backward(ours(bench), seed, 256) for seed in range(4)]))
+    assert found[1] == pytest.approx(found[0], rel=0.12)
 
 
 def test_passes_share_no_random_numbers() -> None:

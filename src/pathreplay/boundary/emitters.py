@@ -5,8 +5,9 @@ emitter is sampled. Two kinds of emitters are exceptions:
 
 - A sphere samples directions in polar coordinates. Close to the pole, straight edges have unbounded curvature in these
   coordinates, and segments cannot resolve them. The square is therefore mapped to a disk first.
-- The samples of a mesh are discontinuous where they change from one triangle to the next. The square is therefore
-  mapped to the cone of directions around a bounding sphere of the mesh.
+- The samples of a mesh are discontinuous where they change from one triangle to the next. The samples of a textured
+  area emitter are discontinuous where they change from one texel to the next. The square is therefore mapped to the
+  cone of directions around a bounding sphere of the shape.
 
 Both maps preserve areas up to a constant factor. When the scene moves, a sampled direction follows its sampled point on
 the emitter, as in the interior term. The maps do not affect this motion.
@@ -51,7 +52,7 @@ interval contains a discontinuity of the emitter samples instead of an edge."""
 
 @dataclass
 class SampledEmitter:
-    """An emitter and, for a mesh, its bounding sphere; the radius is 0 for all other emitters."""
+    """An emitter and, for meshes and textured shapes, its bounding sphere; the radius is 0 for all other emitters."""
 
     ptr: mi.EmitterPtr
     centre: mi.Point3f
@@ -67,7 +68,7 @@ class SampledEmitter:
         polar = mi.Bool(False)
         if trace.traits.sphere_lights:
             polar = ptr.get_shape().shape_type() == int(mi.ShapeType.Sphere)
-        if not trace.traits.mesh_lights:
+        if not trace.traits.broken_lights:
             return SampledEmitter(ptr, mi.Point3f(0), mi.Float(0), polar)
         sphere = dr.gather(mi.Vector4f, trace.traits.tables.emitter_bounds, index, active)
         return SampledEmitter(ptr, mi.Point3f(sphere.x, sphere.y, sphere.z), sphere.w, polar)
@@ -90,7 +91,7 @@ class EmitterProbe:
     Le: mi.Spectrum  # radiance divided by the density of the position
     density: mi.Float  # density of emitter sampling in this direction
     ray: mi.Ray3f
-    hit: mi.PreliminaryIntersection3f  # hit of the shadow ray; may lie on the emitter if the emitter is a mesh
+    hit: mi.PreliminaryIntersection3f  # hit of the shadow ray; may be on the emitter if this has a bounding sphere
     hidden: mi.Bool
 
 
@@ -165,7 +166,7 @@ class EmitterSegment(PlaneSegment):
         light, Le = emitter.ptr.sample_direction(observer.origin, sample_at(trace, emitter, u), active & ~in_cone)
         ray = observer.origin.spawn_ray_to(light.p)
         tested = active & (light.pdf != 0)
-        if not trace.traits.mesh_lights:
+        if not trace.traits.broken_lights:
             hit = observer.behind(ray, observer.hit(ray, tested), tested)
             return EmitterProbe(light, Le, light.pdf, ray, hit, _hides(hit, light.emitter, tested))
         d, Ω = direction(emitter, observer.origin.p, u)
@@ -177,11 +178,11 @@ class EmitterSegment(PlaneSegment):
         hit = dr.select(on_emitter, first, observer.behind(ray, first, tested & ~on_emitter))
         seen = in_cone & hit.is_valid() & (hit.shape.emitter() == emitter.ptr)
         si = hit.compute_surface_interaction(ray, compat.shading(), seen)
-        on_mesh = mi.DirectionSample3f(trace.scene, si=si, ref=observer.origin)
-        on_mesh.d = d
-        light, density = dr.select(in_cone, on_mesh, light), dr.select(in_cone, 0, light.pdf)
+        on_shape = mi.DirectionSample3f(trace.scene, si=si, ref=observer.origin)
+        on_shape.d = d
+        light, density = dr.select(in_cone, on_shape, light), dr.select(in_cone, 0, light.pdf)
         Le = dr.select(in_cone, dr.select(seen, emitter.ptr.eval(si, seen) * Ω, 0), Le)
-        density = dr.select(seen, emitter.ptr.pdf_direction(observer.origin, on_mesh, seen), density)
+        density = dr.select(seen, emitter.ptr.pdf_direction(observer.origin, on_shape, seen), density)
         # Surfaces behind the bounding sphere do not occlude the emitter.
         near = ~in_cone | (hit.t < dr.norm(emitter.centre - observer.origin.p) + emitter.radius)
         return EmitterProbe(light, Le, density, ray, hit, _hides(hit, emitter.ptr, tested) & near)
@@ -189,13 +190,13 @@ class EmitterSegment(PlaneSegment):
     def followed(self, origin: mi.Interaction3f, u: mi.Point2f, anchor: EmitterProbe, active: mi.Bool) -> mi.Vector3f:
         """Return the direction from ``origin`` to the emitter sample at ``u``.
 
-        The result is differentiable in ``u``, in the origin and in the emitter. If the emitter is a mesh, the direction
-        moves like the direction from the origin to the point of the mesh that the ray of ``anchor`` has hit.
+        The result is differentiable in ``u``, in the origin and in the emitter. If the emitter has a bounding
+        sphere, the direction moves like the direction from the origin to the point that the ray of ``anchor`` has hit.
         """
         trace, emitter = self.observer.trace, self.emitter
         in_cone = active & (emitter.radius > 0)
         light, _ = emitter.ptr.sample_direction(origin, sample_at(trace, emitter, u), active & ~in_cone)
-        if not trace.traits.mesh_lights:
+        if not trace.traits.broken_lights:
             return light.d
         d, _ = direction(emitter, origin.p, u)
         y = surface_point(anchor.hit, dr.detach(anchor.ray), in_cone & anchor.hit.is_valid()).p
@@ -244,7 +245,7 @@ class EmitterSegment(PlaneSegment):
         a, b = (self.probe_emitter(t, active) for t in (bracket.a, bracket.b))
         active &= a.hidden != b.hidden
         lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
-        # The outline of a mesh emitter is not a shadow edge.
+        # The outline of the emitter is not a shadow edge.
         active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)
         active &= observer.is_far(dark.hit.t)
         f, pdf = observer.towards(lit.light.d, active)

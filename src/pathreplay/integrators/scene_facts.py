@@ -105,7 +105,7 @@ class SceneFacts:
         elif boxes != self._boxes:
             lengths, sphere = blend_lengths(self._shapes), scene_bounds(self._bounding_box())
             self._tables = replace(self._tables, blend_lengths=lengths, scene_bounds=sphere)
-        if self._traits.mesh_lights:  # vertices may move without a change of the bounding box
+        if self._traits.broken_lights:  # vertices may move without a change of the bounding box
             spheres = emitter_bounds(self._lights, self._shapes)
             if not np.array_equal(np.array(spheres), np.array(self._tables.emitter_bounds)):
                 self._tables = replace(self._tables, emitter_bounds=spheres)

@@ -69,7 +69,7 @@ class Traits:
     hard_lights: bool  # some emitter casts hard shadows
     projectors: tuple[mi.Emitter, ...]  # projectors: the illuminated region has a hard boundary
     spots: tuple[mi.Emitter, ...]  # spot lights: their cone has a hard boundary if beam_width >= cutoff_angle
-    mesh_lights: bool  # some mesh emits
+    broken_lights: bool  # the samples of some emitter are discontinuous: see `_bounding_sphere`
     sphere_lights: bool  # some sphere emits
     coarse_meshes: bool  # some smooth-shaded mesh is coarse: see `is_coarse`
     brushed_meshes: bool  # some coarse mesh has a BSDF that depends on the tangent
@@ -112,7 +112,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         projectors=tuple(light for light in scene.emitters() if light.class_name() == PROJECTOR),
         spots=tuple(light for light in scene.emitters() if light.class_name() == SPOT),
-        mesh_lights=any(_bounding_sphere(mesh)[3] > 0 for mesh in _mesh_emitters(shapes)),
+        broken_lights=any(_bounding_sphere(shape)[3] > 0 for shape in shapes if shape.is_emitter()),
         sphere_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
         coarse_meshes=bool(coarse),
         brushed_meshes=any(is_brushed(shape.bsdf()) for shape in coarse),
@@ -217,9 +217,9 @@ def is_brushed(bsdf: mi.BSDF) -> bool:
 
 
 def emitter_bounds(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:
-    """Return the bounding sphere of each emitter of the scene: centre, and radius (0 for all but mesh emitters)."""
-    meshes = {mesh.emitter(): mesh for mesh in _mesh_emitters(shapes)}
-    spheres = [_bounding_sphere(meshes[emitter]) if emitter in meshes else np.zeros(4) for emitter in emitters]
+    """Return the bounding sphere of each emitter of the scene: centre, and radius (see `_bounding_sphere`)."""
+    shape_of = {shape.emitter(): shape for shape in shapes if shape.is_emitter()}
+    spheres = [_bounding_sphere(shape_of[emitter]) if emitter in shape_of else np.zeros(4) for emitter in emitters]
     return _array(mi.Float, np.ravel(spheres or [np.zeros(4)]))  # an empty array would crash the process
 
 
@@ -235,13 +235,23 @@ def _mesh_emitters(shapes: list[mi.Shape]) -> list[mi.Mesh]:
     return [shape for shape in shapes if shape.is_emitter() and is_mesh(shape)]
 
 
-def _bounding_sphere(mesh: mi.Mesh) -> np.ndarray:
-    """Return centre and radius of a bounding sphere; radius 0 for a rectangle, whose vertices are not accessible."""
-    if (data := compat.mesh_arrays(mi.traverse(mesh))) is None:
+def _bounding_sphere(shape: mi.Shape) -> np.ndarray:
+    """Return centre and radius of the bounding sphere of an emissive shape.
+
+    The radius is 0 for shapes whose emitter samples are continuous in the random numbers. The samples of meshes and of
+    textured emitters are not continuous: they jump from triangle to triangle, and from texel to texel.
+    """
+    data = compat.mesh_arrays(mi.traverse(shape)) if is_mesh(shape) else None
+    if data is not None:
+        positions = data.positions.astype(np.float64)
+        centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
+        return np.array([*centre, np.linalg.norm(positions - centre, axis=1).max()])
+    if not is_painted(shape.emitter()):
         return np.zeros(4)
-    positions = data.positions.astype(np.float64)
-    centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
-    return np.array([*centre, np.linalg.norm(positions - centre, axis=1).max()])
+    box = shape.bbox()
+    half = np.array([float(x) for x in box.extents()]) / 2
+    radius = half.max() if shape.shape_type() == mi.ShapeType.Sphere else np.linalg.norm(half)
+    return np.array([*(float(x) for x in box.center()), radius])
 
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
