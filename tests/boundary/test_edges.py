@@ -355,6 +355,25 @@ def test_the_texels_of_a_lamp_are_no_edges(kind: str, place: Any) -> None:
     assert found[1] == pytest.approx(found[0], rel=0.12)
 
 
+def test_distant_sensors_see_outlines_move() -> None:
+    """A black card before a white sky, seen by a sensor whose rays end on a square of 3 x 3."""
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    seen = {"type": "rectangle", "to_world": scenes.T().scale(1.5)}
+    eye = {"type": "distant", "direction": [0, 0, -1], "target": seen, "film": film}
+    card = scenes.shape(scenes.T().translate([0.3, 0.2, 0]).rotate([0, 0, 1], 20).scale([0.5, 0.4, 1]), scenes.BLACK)
+    scene = mi.load_dict({"type": "scene", "eye": eye, "card": card, "sky": {"type": "constant", "radiance": 1.0}})
+    params, size = mi.traverse(scene), mi.Float(1)
+    still = mi.Transform4f(params["card.to_world"])
+    dr.enable_grad(size)
+    params["card.to_world"] = still @ mi.Transform4f().scale(mi.Point3f(size, size, 1))
+    params.update()
+    image = mi.render(scene, params, integrator=mi.load_dict({"type": "pathreplay", "max_depth": 2}), spp=2**17)
+    dr.backward(dr.mean(image, axis=None))
+    params["card.to_world"] = still
+    params.update()
+    assert dr.grad(size)[0] == pytest.approx(-2 * 0.8 / 9, rel=0.08)
+
+
 def test_passes_share_no_random_numbers() -> None:
     """With keys of i ^ seed, lines of all passes would be the same, in another order."""
     lanes = 2**14

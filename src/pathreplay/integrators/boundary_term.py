@@ -34,7 +34,7 @@ GRID = "SDFGrid"
 kept at fixed surface coordinates."""
 BATCH = "BatchSensor"
 """Class of sensors whose rays cannot be differentiated with respect to film position: Dr.Jit terminates the process."""
-FILM_LENGTH = 0.5  # length of segments on the film, in pixels
+FILM_LENGTH = 0.5  # length of segments on the film, in pixels; shorter on a film of one pixel: see `FilmPlaces.detail`
 INNER_LENGTHS = 0.25, 0.1  # length of segments in the unit square of emitter samples; length of arcs in radians
 
 
@@ -119,11 +119,11 @@ class Boundary:
             raise PathreplayError(f"{why}, or use boundary = 'none'")
         trace = self.informed(view, trace)
         n, seed = segments_of(view, places, self.spp), Stream.BOUNDARY.of(view.opaque_seed)
-        on_film, inner = max(n // FILM_CLOSER, 1), max(n // INNER_CLOSER, 1)
+        on_film, inner, length = max(n // FILM_CLOSER, 1), max(n // INNER_CLOSER, 1), FILM_LENGTH * places.detail
         if self.film:
-            yield PrimarySearch.of(trace, places, FILM_LENGTH).find(n, on_film, seed)
+            yield PrimarySearch.of(trace, places, length).find(n, on_film, seed)
             if trace.media is not None and trace.traits.hard_lights:
-                yield VolumetricSearch.of(trace, places, FILM_LENGTH).find(n, on_film, seed)
+                yield VolumetricSearch.of(trace, places, length).find(n, on_film, seed)
         if self.inner:
             yield SecondarySearch.of(trace, places, INNER_LENGTHS).find(n, inner, seed)
 

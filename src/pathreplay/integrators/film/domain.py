@@ -15,6 +15,12 @@ from pathreplay.samplers.streams import Stream
 
 PROJECTING = frozenset({"PerspectiveCamera", "ThinLensCamera"})
 """Classes of sensors that can project a point onto the film."""
+BY_APERTURE = frozenset({"DistantSensorImpl"})
+"""Classes of sensors whose rays depend on the aperture sample only. The film position takes its place here, so that
+rays differ between film positions."""
+PIXELS = 32
+"""Resolution assumed for a sensor of `BY_APERTURE`. Its single pixel contains the whole scene, and a segment of half a
+pixel would miss most objects."""
 QUADRATURE = 128
 """Number of quadrature points of the integral over a filter."""
 
@@ -39,8 +45,20 @@ class FilmPlaces:
         sensor, sampler, position = self.view.sensor, CounterSampler.stream(key, Stream.CAMERA), self.in_sensor(s)
         time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = sampler.next_1d(), sampler.next_2d()
+        if self.is_coarse:
+            aperture = position
         ray, weight = self.view.camera_ray(time, wavelength, position, aperture)
         return mi.Ray3f(ray), dr.detach(weight)
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether a single pixel contains the whole scene."""
+        return self.view.sensor.class_name() in BY_APERTURE
+
+    @property
+    def detail(self) -> float:
+        """Size in pixels of the details that the sensor sees: 1 unless `is_coarse`."""
+        return 1 / PIXELS if self.is_coarse else 1.0
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
         """Return whether the camera ray through a film position may move under the film flow: see `FilmDomain`."""
