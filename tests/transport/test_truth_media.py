@@ -29,13 +29,14 @@ from media_scenes import (
     sparse,
     sunlit,
 )
+from mitsuba_configs import square
 from pathreplay.adjoint.baseline import BaselineCells
 from pathreplay.testing.objective import Move
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.stencil import UPWARD, WIDE
 from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from places import SUPPORT
-from truth import Case, add, hold, random, rgb, translate
+from truth import Case, add, bitmap, hold, random, rgb, translate
 
 MEDIUM = "object.interior_medium."
 DENSITY, ALBEDO, G = MEDIUM + "sigma_t.data", MEDIUM + "albedo.data", MEDIUM + "phase_function.g"
@@ -316,6 +317,31 @@ def test_one_thread_and_many_agree(channels: int) -> None:
     one, many, again = found
     assert np.abs(many - again).max() < 1e-4 * np.abs(one).max()
     assert np.abs(many - one).max() < 1e-4 * np.abs(one).max()
+
+
+@pytest.mark.parametrize("painted", [False, True])
+def test_light_of_a_mesh_grows_with_it_behind_a_boundary(painted: bool) -> None:
+    """A small lamp above fog that is hardly there, and above a sheet that lets half of the light through."""
+    T = mi.ScalarTransform4f
+    glow = bitmap(np.full((4, 4, 3), 9)) if painted else rgb(9, 9, 9)
+    place = T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.05)
+    half = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "diffuse"}}
+    sheet = {"type": "rectangle", "to_world": T().translate([0, 1.5, 0]).rotate([1, 0, 0], 90).scale(2), "bsdf": half}
+    lamp = square(place, emitter={"type": "area", "radiance": glow})
+    scene = mi.load_dict(lit_floor(homogeneous(1e-3, 0.0)) | {"light": lamp, "sheet": sheet}, optimize=False)
+    params = mi.traverse(scene)
+    key = next(key for key in params.keys() if key.startswith("light.") and key.endswith("vertex_positions"))
+    still, growth = mi.Float(params[key]), mi.Float(0)
+    centre = np.tile(np.array([0, 2, 0], np.float32), dr.width(still) // 3)
+    dr.enable_grad(growth)
+    params[key] = still + growth * (still - mi.Float(centre))
+    params.update()
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2, "boundary": "none"})
+    image = mi.render(scene, params, integrator=integrator, spp=64)
+    dr.backward(dr.mean(image, axis=None))
+    params[key] = still
+    params.update()
+    assert dr.grad(growth)[0] == pytest.approx(2 * dr.mean(image, axis=None).array[0], rel=0.05)
 
 
 SPECTRAL = """

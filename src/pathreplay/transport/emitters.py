@@ -11,6 +11,9 @@ from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import Arrival, Lighting, TraceConfig, mis_weight, reciprocal
 from pathreplay.transport.volume.passage import skip_null
 
+SHORT = 1e-3
+"""Fraction of the distance to an emitter sample at which a ray starts before the sample: see `_hit_of_sample`."""
+
 
 def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool) -> mi.Spectrum:
     """Return the MIS-weighted radiance that the hit surface, or on a miss the environment, emits to the ray's origin.
@@ -81,7 +84,7 @@ def redraw_emitter(
             painted = lit & is_painted(still.emitter) & still.emitter.get_shape().is_mesh()
         light, Le = scene.sample_emitter_direction(origin, u, False, lit & ~painted)
         if trace.traits.lights_deform:
-            Le *= _mesh_growth(scene, origin, light, lit & ~painted)
+            Le *= _mesh_growth(trace, origin, light, lit & ~painted)
         if trace.traits.painted_meshes:
             at_fixed_point, glow = _at_fixed_point(trace, origin, still, painted)
             light, Le = dr.select(painted, at_fixed_point, light), dr.select(painted, glow, Le)
@@ -99,11 +102,7 @@ def _at_fixed_point(
     ``still`` is the detached sample. Mitsuba samples such a mesh by intersecting it in texture space. Mitsuba's own
     attached sample would not keep its barycentric coordinates when the mesh moves.
     """
-    ray = dr.detach(origin.spawn_ray_to(still.p))
-    ray.maxt = dr.largest(mi.Float)
-    hit = meet(trace, ray, active)
-    if trace.media is not None:
-        hit = skip_null(trace, ray, hit, active)
+    hit, ray = _hit_of_sample(trace, origin, still, active)
     y = surface_point(hit, ray, active)
     towards = y.p - origin.p
     facing = dr.abs(dr.dot(y.A, towards))
@@ -121,14 +120,28 @@ def _at_fixed_point(
     return light, Le * J
 
 
-def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:
+def _hit_of_sample(
+    trace: TraceConfig, origin: mi.Interaction3f, light: mi.DirectionSample3f, active: mi.Bool
+) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
+    """Return the hit of the ray from ``origin`` to a visible emitter sample, and the ray. Detached.
+
+    With media, the ray may pass null boundaries and sheets that transmit light. It then starts shortly before the
+    sample, behind all of them.
+    """
+    ray = dr.detach(origin.spawn_ray_to(light.p))
+    if trace.media is not None:
+        ray.o = dr.lerp(dr.detach(light.p), ray.o, SHORT)
+    ray.maxt = dr.largest(mi.Float)
+    hit = meet(trace, ray, active)
+    return (hit if trace.media is None else skip_null(trace, ray, hit, active)), ray
+
+
+def _mesh_growth(trace: TraceConfig, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:
     """Return a factor of value 1, whose derivative is the derivative of the log area of the sampled triangle.
 
     The factor is needed because Mitsuba samples a mesh with the triangle areas at load time, without derivatives.
     """
-    ray = dr.detach(origin.spawn_ray_to(light.p))
-    ray.maxt = dr.largest(mi.Float)
-    hit = scene.ray_intersect_preliminary(ray, active=lit)
+    hit, ray = _hit_of_sample(trace, origin, light, lit)
     on_mesh = lit & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == light.emitter)
     return area_growth(hit, ray, on_mesh)
 
