@@ -24,6 +24,7 @@ from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.jobs import make_config, optimize
 from pathreplay.scenes.loading import load_scene
+from pathreplay.transport.facts.nodes import with_gradients
 from places import ROOT
 from variant import VARIANT
 
@@ -111,6 +112,43 @@ def test_value_and_grad_is_the_gradient_of_the_loss(photos: list[np.ndarray]) ->
         expected = (loss(start + step) - loss(start - step)) / (2 * h)
         error = found[:, k].std(ddof=1) / np.sqrt(len(found))
         assert abs(found[:, k].mean() - expected) < 4 * error + 0.01 * abs(expected), k
+
+
+def evaluated(problem: Problem) -> None:
+    pathreplay.value_and_grad(problem)(seed=1)
+
+
+def stepped(problem: Problem) -> None:
+    pathreplay.step(problem, pathreplay.init(problem))
+
+
+def interrupted(problem: Problem) -> None:
+    def fail(iteration: Any) -> None:
+        raise ValueError
+
+    with pytest.raises(ValueError):
+        pathreplay.minimize(problem, steps=2, callbacks=[fail], progress=False)
+
+
+@pytest.mark.parametrize("call", [evaluated, stepped, interrupted])
+def test_a_scene_keeps_no_gradients(call: Callable[[Problem], None], photos: list[np.ndarray]) -> None:
+    """Forward mode in another scene would fail at them. The values are those of the last evaluation."""
+    wanted = {TEXTURE: Parameter(initial=0.25), BODY: Parameter(pose="rigid")}
+    problem = Problem(room(), wanted, views(photos), spp=1)
+    call(problem)
+    assert not with_gradients(problem.scene)
+    np.testing.assert_array_equal(mi.traverse(problem.scene)[TEXTURE], np.full((4, 4, 3), 0.25, np.float32))
+    scene, x = mi.load_dict(room()), mi.Float(0.5)
+    dr.enable_grad(x)
+    params = mi.traverse(scene)
+    params[WALL] = mi.Color3f(x)
+    params.update()
+    image = mi.render(scene, params, integrator=mi.load_dict({"type": "pathreplay"}), spp=1)
+    dr.forward(x)
+    slope = np.array(dr.grad(image))
+    params[WALL] = mi.Color3f(0.5)
+    params.update()
+    assert slope.sum() > 0
 
 
 def test_regularizers_are_in_loss_and_gradient(photos: list[np.ndarray]) -> None:

@@ -51,6 +51,12 @@ def test_the_scene_keeps_no_graph_and_values_are_not_shared(function: SceneFunct
     assert not any(dr.grad_enabled(value) for value in values)
 
 
+def test_the_scene_keeps_no_graph_after_an_error(function: SceneFunction) -> None:
+    with pytest.raises(PathreplayError, match="The gradient cannot be computed"):
+        function.gradient(values_of(function), FEW, mi.TensorXf(np.ones((5, 6, 3), np.float32)))
+    assert not any(dr.grad_enabled(function.params[key]) for key in function.keys)
+
+
 def test_what_does_not_fit_is_told(function: SceneFunction) -> None:
     shapes = {key: value.shape for key, value in function._start.items()}
     function.require(shapes)

@@ -11,6 +11,7 @@ from pathreplay.inverse.config.schema import ITERATION
 from pathreplay.inverse.objective.evaluate import Shard, total
 from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.parameters.values import Array
+from pathreplay.inverse.problem.problem import detach
 from pathreplay.library.problem import Problem
 
 ValueAndGrad = Callable[..., tuple[float, dict[str, Array]]]
@@ -45,7 +46,10 @@ def value_and_grad(problem: Problem) -> ValueAndGrad:
             Shard((n,), samples, config.seeds(ITERATION, view.sensor, seed, 1)) for n, view in built.trained().items()
         ]
         with built.computing():
-            found = total((evaluator(at, shard, {}) for shard in shards), owned=True)
+            try:
+                found = total((evaluator(at, shard, {}) for shard in shards), owned=True)
+            finally:
+                detach(built)
         loss, gradients = found.loss, found.gradients
         for variable in built.variables:
             if variable.penalty is not None:

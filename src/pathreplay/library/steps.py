@@ -151,6 +151,7 @@ def step(problem: Problem, state: State) -> State:
             take_step(built, run, min(len(state.history), built.config.iterations - 1))
     finally:
         restore_films(built)
+        inner.detach(built)
     require_gradients(built, run)
     found = best_values(built, run)
     kept = _copied(optimiser.state())

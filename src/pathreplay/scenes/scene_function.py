@@ -98,20 +98,22 @@ class SceneFunction:
         sensor, seed, spp = view
         other = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
         with dr.resume_grad(), errors_as("The gradient cannot be computed"):
-            seen = self._put(values, grad=True)
-            image = mi.render(
-                self.scene,
-                self.params,
-                sensor=sensor,
-                integrator=self.integrator,
-                spp=spp,
-                seed=seed,
-                seed_grad=other,
-            )
-            dr.backward_from(dr.sum(image * weights, axis=None))
-            gradients = [dr.grad(value) for value in seen]
-            dr.eval(gradients)
-            self._put(values, grad=False)  # frees the AD graph to which the scene refers
+            try:
+                seen = self._put(values, grad=True)
+                image = mi.render(
+                    self.scene,
+                    self.params,
+                    sensor=sensor,
+                    integrator=self.integrator,
+                    spp=spp,
+                    seed=seed,
+                    seed_grad=other,
+                )
+                dr.backward_from(dr.sum(image * weights, axis=None))
+                gradients = [dr.grad(value) for value in seen]
+                dr.eval(gradients)
+            finally:
+                self._put(values, grad=False)  # frees the AD graph to which the scene refers
         return gradients
 
     def _put(self, values: Sequence[mi.TensorXf], grad: bool) -> list[mi.TensorXf]:

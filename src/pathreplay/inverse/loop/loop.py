@@ -54,7 +54,7 @@ from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.mesh import Surface
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import latent_bounds, latents
-from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, sensor_of
+from pathreplay.inverse.problem.problem import Problem, detach, errors_of, put_values, sensor_of
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
 
@@ -179,6 +179,7 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
                 break
     finally:
         restore_films(problem)
+        detach(problem)
     yield Stopped(len(run.history))
 
 

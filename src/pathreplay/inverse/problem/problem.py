@@ -57,7 +57,7 @@ from pathreplay.inverse.parameters.variables import Variable, free_of, keys_of, 
 from pathreplay.inverse.problem import feasibility
 from pathreplay.inverse.problem.completed import completed
 from pathreplay.platform.threads import one_thread
-from pathreplay.platform.traversal import traversed
+from pathreplay.platform.traversal import known_values, traversed
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import errors_as, load_integrator
 from pathreplay.scenes.loading import load_scene_for
@@ -200,6 +200,19 @@ def put_values(problem: Problem, values: Arrays) -> None:
     """Set the parameters of the scene, or of all scenes, to the values of the variables, without gradients."""
     for each in problem.scenes():
         each.params.update(scene_values(each, each.cache.variables(each, values)))
+
+
+def detach(problem: Problem) -> None:
+    """Detach the parameters of the scene, or of all scenes, after a gradient pass. Their values stay as they are.
+
+    Dr.Jit traces virtual function calls through all scenes that exist. Gradients that stay enabled in one scene would
+    make forward mode fail in all others.
+    """
+    for each in problem.scenes():
+        for key, value in known_values(each.params):
+            if dr.grad_enabled(value):
+                each.params[key] = dr.detach(value)
+        each.params.update()
 
 
 def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
