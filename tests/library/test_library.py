@@ -114,6 +114,22 @@ def test_value_and_grad_is_the_gradient_of_the_loss(photos: list[np.ndarray]) ->
         assert abs(found[:, k].mean() - expected) < 4 * error + 0.01 * abs(expected), k
 
 
+@pytest.mark.parametrize("key", ["body.bsdf.eta", "floor.bsdf.reflectance.to_uv"])
+def test_numbers_that_a_user_changes_reach_recorded_kernels(key: str, photos: list[np.ndarray]) -> None:
+    """Mitsuba stores these parameters as plain numbers, which kernels contain as constants."""
+    body = {**room()["body"], "bsdf": {"type": "dielectric"}}
+    problem = Problem(mi.load_dict(room() | {"body": body}), {WALL: GREY}, View("left", photos[0]), spp=4)
+    f = pathreplay.value_and_grad(problem)
+    before = [f(seed=7)[0] for _ in range(3)][-1]  # the second call records
+    params = mi.traverse(problem.scene)
+    params[key] = 1.1 if key.endswith("eta") else mi.ScalarTransform3f().scale([3, 2])
+    params.update()
+    (loss, gradients), (expected, slopes) = f(seed=7), pathreplay.value_and_grad(problem)(seed=7)
+    assert abs(expected - before) > 1e-3 * before
+    assert loss == pytest.approx(expected, rel=1e-4)
+    np.testing.assert_allclose(gradients[WALL], slopes[WALL], rtol=1e-3, atol=1e-6)
+
+
 def evaluated(problem: Problem) -> None:
     pathreplay.value_and_grad(problem)(seed=1)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pathreplay.integrators.lifetimes import SCENES, is_recording
 from pathreplay.platform import compat
-from pathreplay.transport.facts.nodes import is_mesh, nodes_of, with_gradients
+from pathreplay.transport.facts.nodes import is_mesh, nodes_of, plain_numbers, with_gradients
 from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
     INSTANCE,
@@ -52,6 +52,10 @@ class SceneFacts:
         self._textures = [node for node in nodes if isinstance(node, mi.Texture)]
         self._seams: bool | None = None
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
+        self._bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
+        self._with_constants = [
+            node for node in nodes if isinstance(node, _kinds_with_constants()) and plain_numbers(node)
+        ]
 
     def are_about(self, scene: mi.Scene) -> bool:
         """Return whether the facts describe this scene with its current sensors, emitters, shapes and BSDFs."""
@@ -76,8 +80,13 @@ class SceneFacts:
         return scene_media(self._media, self._traits.veils, sensor, branches)
 
     def constants(self) -> tuple[object, ...]:
-        """Return the current values that media supply to kernels as constants: see `GridMedium.constants`."""
-        return tuple(medium.constants for medium in self._media if hasattr(medium, "constants"))
+        """Return the current values that kernels treat as constants.
+
+        These are the parameters that Mitsuba stores as plain numbers, such as the ``eta`` of `dielectric`, the lobes of
+        BSDFs, and the values of `GridMedium.constants`.
+        """
+        of_media = tuple(medium.constants for medium in self._media if hasattr(medium, "constants"))
+        return (*of_media, *map(plain_numbers, self._with_constants), *(bsdf.flags() for bsdf in self._bsdfs))
 
     def branches(self) -> bool:
         """Return the current value of `Media.branches`."""
@@ -142,6 +151,11 @@ class SceneFacts:
         for shape in self._placed:
             box.expand(shape.bbox())
         return box
+
+
+def _kinds_with_constants() -> tuple[type, ...]:
+    """Return the types of objects whose plain numbers are constants of kernels."""
+    return mi.BSDF, mi.Texture, mi.Volume, mi.Medium, mi.PhaseFunction, mi.Emitter
 
 
 def _sizes(shapes: list[mi.Shape]) -> list[tuple[int, int]]:

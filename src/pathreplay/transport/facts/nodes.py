@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
@@ -58,6 +59,21 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
                 seen.add(child)
                 waiting.append(child)
     return seen
+
+
+def plain_numbers(node: mi.Object) -> tuple[object, ...]:
+    """Return the parameters of a node that Mitsuba stores as plain numbers, not as arrays of Dr.Jit.
+
+    Kernels contain these numbers. The sampling weights of emitters are left out, because a scene copies them to arrays.
+    """
+    plain: list[object] = []
+    for name, value, cpptype in _contents(node)[1]:
+        value = value if cpptype is None else mi.get_property(value, cpptype, node)
+        if isinstance(value, (bool, int, float)) and name != "sampling_weight":
+            plain.append(value)
+        elif isinstance(value, (mi.ScalarTransform3f, mi.ScalarTransform4f)):
+            plain.append(np.array(value.matrix).tobytes())
+    return tuple(plain)
 
 
 def with_gradients(root: mi.Object, *names: str) -> list[Any]:
