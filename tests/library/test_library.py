@@ -114,15 +114,21 @@ def test_value_and_grad_is_the_gradient_of_the_loss(photos: list[np.ndarray]) ->
         assert abs(found[:, k].mean() - expected) < 4 * error + 0.01 * abs(expected), k
 
 
-@pytest.mark.parametrize("key", ["body.bsdf.eta", "floor.bsdf.reflectance.to_uv"])
+@pytest.mark.parametrize(
+    "key", ["body.bsdf.eta", "floor.bsdf.reflectance.to_uv", "body.interior_medium.phase_function.g"]
+)
 def test_numbers_that_a_user_changes_reach_recorded_kernels(key: str, photos: list[np.ndarray]) -> None:
-    """Mitsuba stores these parameters as plain numbers, which kernels contain as constants."""
+    """Dr.Jit cannot see these parameters, and kernels contain them as constants."""
     body = {**room()["body"], "bsdf": {"type": "dielectric"}}
+    if "medium" in key:
+        phase = {"type": "hg", "g": 0.5}
+        body |= {"bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "sigma_t": 9.0, "phase": phase}}
     problem = Problem(mi.load_dict(room() | {"body": body}), {WALL: GREY}, View("left", photos[0]), spp=4)
     f = pathreplay.value_and_grad(problem)
     before = [f(seed=7)[0] for _ in range(3)][-1]  # the second call records
     params = mi.traverse(problem.scene)
-    params[key] = 1.1 if key.endswith("eta") else mi.ScalarTransform3f().scale([3, 2])
+    other = {"eta": 1.1, "to_uv": mi.ScalarTransform3f().scale([3, 2]), "g": -0.7}
+    params[key] = other[key.rpartition(".")[2]]
     params.update()
     (loss, gradients), (expected, slopes) = f(seed=7), pathreplay.value_and_grad(problem)(seed=7)
     assert abs(expected - before) > 1e-3 * before

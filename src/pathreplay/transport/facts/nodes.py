@@ -62,17 +62,22 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
 
 
 def plain_numbers(node: mi.Object) -> tuple[object, ...]:
-    """Return the parameters of a node that Mitsuba stores as plain numbers, not as arrays of Dr.Jit.
+    """Return the parameters of a node that a frozen function treats as constants.
 
-    Kernels contain these numbers. The sampling weights of emitters are left out, because a scene copies them to arrays.
+    Mitsuba stores most of them as plain numbers. The sampling weights of emitters are left out, because a scene copies
+    them to arrays. The parameters of phase functions are arrays, which phase functions do not show to Dr.Jit. They are
+    left out if they have gradients, because a function that uses such arrays cannot be frozen.
     """
     plain: list[object] = []
+    hides = isinstance(node, mi.PhaseFunction)
     for name, value, cpptype in _contents(node)[1]:
         value = value if cpptype is None else mi.get_property(value, cpptype, node)
         if isinstance(value, (bool, int, float)) and name != "sampling_weight":
             plain.append(value)
         elif isinstance(value, (mi.ScalarTransform3f, mi.ScalarTransform4f)):
             plain.append(np.array(value.matrix).tobytes())
+        elif hides and dr.is_array_v(value) and not dr.grad_enabled(value):
+            plain.append(np.array(value).tobytes())
     return tuple(plain)
 
 
