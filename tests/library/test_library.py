@@ -601,6 +601,8 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
     assert textured.render({TEXTURE: np.zeros((8, 8, 3))}, spp=1).shape == (SIDE, SIDE, 3)
     with pytest.raises(PathreplayError, match="'iterations' is 0"):
         pathreplay.minimize(problem, steps=0, progress=False)
+    with pytest.raises(PathreplayError, match="minimize: 'response' belongs to the problem; give it to Problem"):
+        pathreplay.minimize(problem, response={"kind": "gamma"}, progress=False)
 
 
 @pytest.mark.parametrize("write", [pytest.param(s, id=s.__name__) for s in SCENES])

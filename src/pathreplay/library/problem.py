@@ -36,7 +36,7 @@ MOST_ITERATIONS = 10**6
 """Number of iterations in the config of a problem that does not define it. Every ``refine_at`` must be below it."""
 OF_A_PROBLEM = frozenset(
     "scene scene_parameters sensors test_views variant integrator baseline parameters derived capture exposure "
-    "view_weights target loss learning_rate deterministic memory_limit".split()
+    "response view_weights target loss learning_rate deterministic memory_limit".split()
 )
 """Keys of a job that are fixed when the problem is created."""
 OF_VIEWS = {
