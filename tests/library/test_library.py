@@ -311,6 +311,20 @@ def test_mitsubas_adam_takes_the_steps_of_ours(photos: list[np.ndarray]) -> None
     np.testing.assert_allclose(theirs.values[WALL], ours.values[WALL], rtol=1e-4)
 
 
+@pytest.mark.parametrize("of_job", ["l-bfgs-b", "levenberg-marquardt"])
+def test_an_optimizer_object_in_place_of_a_search_sees_new_random_numbers(
+    of_job: str, photos: list[np.ndarray]
+) -> None:
+    """At a learning rate of almost zero, losses differ by their noise alone."""
+    problem = Problem(room(), {WALL: GREY}, views(photos), spp=4, optimizer={"type": of_job})
+    state = pathreplay.init(problem, mi.ad.Adam(lr=1e-9))
+    for _ in range(2):
+        state = pathreplay.step(problem, state)
+    history = pathreplay.minimize(problem, mi.ad.Adam(lr=1e-9), steps=2, progress=False).history
+    for first, second in (state.history, history):
+        assert abs(first.loss - second.loss) > 1e-4 * first.loss
+
+
 @pytest.mark.parametrize("key", [WALL, "wall.*reflectance*", BODY])
 def test_learning_rates_of_parameters_are_those_of_mitsubas_optimizer(key: str, photos: list[np.ndarray]) -> None:
     """The first step of Adam has the length of the rate: of a key, of a glob, and of a pose."""

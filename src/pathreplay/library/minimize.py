@@ -119,7 +119,7 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         PathreplayError: settings are invalid, loss or values are not finite, or the folder is in use, damaged, or
             belongs to another problem.
     """
-    options, own = options_of(optimizer)
+    options, own = options_of(optimizer, problem.built.config.optimizer)
     settings |= {
         "stages": None if stages is None else [dict(stage) for stage in stages],
         "learning_rate_schedule": learning_rate_schedule,

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.loop.loop import optimiser_of
 from pathreplay.inverse.optim.adaptive import Optimiser, State
 from pathreplay.inverse.parameters.exposures import EXPOSURE
@@ -201,11 +202,13 @@ def _rated(problem: Problem) -> set[str]:
     return own | {key for key, options in fitted.items() if options is not None and options.learning_rate}
 
 
-def options_of(optimizer: object) -> tuple[Json | None, object]:
+def options_of(optimizer: object, known: Optimizer) -> tuple[Json | None, object]:
     """Split the argument ``optimizer`` of `minimize` into options of a job and an object of the user.
 
-    The object is None for a name or a mapping. The options are None for an optimizer object. Both are None if
-    ``optimizer`` is None. A function gets the options of ``l-bfgs-b``. Raises PathreplayError for any other argument.
+    The object is None for a name or a mapping. The options are None for an optimizer object, except that such an object
+    replaces a search, and then gets the options of ``adam``: in a search, all iterations have the same random numbers.
+    Both are None if ``optimizer`` is None. A function gets the options of ``l-bfgs-b``. ``known`` is the optimizer of
+    the problem's job. Raises PathreplayError for any other argument.
     """
     if optimizer is None or isinstance(optimizer, str):
         return None if optimizer is None else {"type": optimizer}, None
@@ -214,7 +217,7 @@ def options_of(optimizer: object) -> tuple[Json | None, object]:
     if isinstance(optimizer, type):
         raise PathreplayError(f"optimizer: {optimizer.__name__} is a class; create an object of it")
     if hasattr(optimizer, "step"):
-        return None, optimizer
+        return {"type": "adam"} if known.searches else None, optimizer
     if callable(optimizer):
         return {"type": "l-bfgs-b"}, optimizer  # `LineSearch` runs such functions in place of L-BFGS-B
     raise PathreplayError(

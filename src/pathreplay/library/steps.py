@@ -109,7 +109,7 @@ def init(
     Raises:
         PathreplayError: the settings are invalid, or ``executor`` is not ``local``.
     """
-    options, own = options_of(optimizer)
+    options, own = options_of(optimizer, problem.built.config.optimizer)
     task = _Task(run_settings("init", steps, options, settings))
     built, executor = task.of(problem, "init")
     run = new_run(built, built.integrator, optimizer=built.config.optimizer, executor=executor)
