@@ -242,6 +242,21 @@ def test_another_depth_or_boundary_leaves_the_other_properties_of_an_own_pathrep
     assert stateful(edges).options() == options | {"attach": "delta", "boundary": "primary"}
 
 
+def test_another_depth_or_boundary_leaves_an_own_pathreplay_particles() -> None:
+    own = {"type": "pathreplay_particles", "max_depth": 6, "hide_emitters": True, "attach": "none"}
+    scene = mi.load_dict({"type": "scene", "integrator": own})
+    options = stateful(scene.integrator()).options()
+    for changes, depth in (({"max_depth": 3}, 3), ({"boundary": {"boundary": "none"}}, 6)):
+        tested = integrator_under_test(None, scene, **changes)
+        assert type(tested) is type(scene.integrator())
+        assert read_limits(tested) == Limits(depth, 5, True)
+        assert stateful(tested).options() == options and options["attach"] == "none"
+    named = integrator_under_test("pathreplay_particles", scene, boundary={"boundary": "none", "boundary_spp": 3})
+    assert stateful(named).options()["boundary_spp"] == 3
+    with pytest.raises(PathreplayError, match="'boundary' is a property of 'pathreplay', and the integrator is 'prb'"):
+        integrator_under_test("prb", scene, boundary={"boundary": "none"})
+
+
 def test_another_depth_of_an_integrator_with_unknown_properties_is_refused() -> None:
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "prb_projective", "sppi": 0}})
     assert integrator_under_test(None, scene) is scene.integrator()

@@ -27,6 +27,10 @@ LONGEST_WITHOUT_ROULETTE = 64
 """Largest ``max_depth`` at which the reference disables Russian roulette. Without roulette, paths in a closed room end
 only at ``max_depth``."""
 
+PARTICLES = "pathreplay_particles"
+_WITH_BOUNDARY = ("pathreplay", PARTICLES)
+"""Plugins with the properties ``boundary`` and ``boundary_spp``."""
+
 _ONLY_LIMITS = {"PRBIntegrator": "prb", "BasicPRBIntegrator": "prb_basic", "PRBVolpathIntegrator": "prbvolpath"}
 """Plugins by class, for the differentiable integrators of Mitsuba that have no other properties than `Limits`."""
 
@@ -38,12 +42,13 @@ def integrator_under_test(
 
     None selects the scene's own integrator if it is differentiable, else ``pathreplay``. A plugin given by name, or
     selected by None, gets the path limits of the scene's own integrator. ``max_depth`` replaces the path length of the
-    integrator. ``boundary`` contains additional properties of `pathreplay` (``boundary``, ``boundary_spp``). With
-    ``boundary``, None selects `pathreplay`. If the scene's own integrator is selected, it keeps its other properties.
+    integrator. ``boundary`` contains additional properties (``boundary``, ``boundary_spp``). With ``boundary``, None
+    selects the scene's own integrator if it has these properties, else ``pathreplay``. If the scene's own integrator is
+    selected, it keeps its other properties.
 
     Raises PathreplayError if Mitsuba cannot create the integrator, if ``max_depth`` is invalid or given with an object,
     if the other properties of the scene's own integrator cannot be read to replace its ``max_depth``, or if boundary
-    terms are requested from another integrator than `pathreplay`.
+    terms are requested from an integrator without these properties.
     """
     if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
         raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
@@ -59,14 +64,16 @@ def integrator_under_test(
         description = dict(spec)
     else:
         limits = None if own is None else read_limits(own)
-        name = spec or ("pathreplay" if boundary else _own_name(own))
+        name = spec or _own_name(own, bool(boundary))
         description = {"type": name, **({} if limits is None else vars(limits))}
-        options = {} if own is None or name != "pathreplay" else stateful(own).options()
+        options = {} if own is None or name not in _WITH_BOUNDARY else stateful(own).options()
+        if name == PARTICLES:
+            options.pop("caustics", None)
         kept = ("boundary", "boundary_spp", "caustics") if spec else tuple(options)
         description |= {option: options[option] for option in kept if option in options}
     if max_depth is not None:
         description["max_depth"] = max_depth
-    if boundary and description.get("type") != "pathreplay":
+    if boundary and description.get("type") not in _WITH_BOUNDARY:
         raise PathreplayError(
             f"'{min(boundary)}' is a property of 'pathreplay', and the integrator is '{description.get('type')}'; test "
             "'pathreplay', or leave it out"
@@ -74,14 +81,17 @@ def integrator_under_test(
     return load_integrator(description | dict(boundary or {}))
 
 
-def _own_name(own: mi.Integrator | None) -> str:
-    """Return the plugin that continues the scene's own integrator with another ``max_depth``.
+def _own_name(own: mi.Integrator | None, has_boundary: bool) -> str:
+    """Return the plugin that continues the scene's own integrator with other properties.
 
-    Raises PathreplayError if the integrator is differentiable, and may have properties that cannot be read.
+    With ``has_boundary``, properties of boundary terms are among them; otherwise only ``max_depth``. Raises
+    PathreplayError if the integrator is differentiable, and may have properties that cannot be read.
     """
-    if not isinstance(own, mi.CppADIntegrator) or stateful(own).options():
-        return "pathreplay"
     name = type(own).__name__
+    if own is not None and stateful(own).options():
+        return PARTICLES if name == "ParticleIntegrator" else "pathreplay"
+    if has_boundary or not isinstance(own, mi.CppADIntegrator):
+        return "pathreplay"
     if name not in _ONLY_LIMITS:
         raise PathreplayError(
             f"max_depth cannot be given for the scene's own {name}, whose other properties would be lost; set it in "
