@@ -212,7 +212,7 @@ def test_choice_of_integrators() -> None:
     assert read_limits(integrator_under_test("prb", scene, max_depth=7)).max_depth == 7  # type: ignore[union-attr]
     assert reference_integrator(None, scene, scene.integrator()).class_name() == "VolumetricPathIntegrator"
     with pytest.raises(PathreplayError, match="does not expose its max_depth"):
-        reference_integrator(None, scene, mi.load_dict({"type": "direct"}))
+        reference_integrator(None, scene, mi.load_dict({"type": "depth"}))
     in_fog = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "medium": {"type": "homogeneous"}}})
     in_it = reference_integrator(None, in_fog, scene.integrator())
     assert in_it.class_name() == "VolumetricPathIntegrator"

@@ -9,6 +9,10 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay.integrators.path_integrator import UNBOUNDED
+from pathreplay.transport.facts.nodes import nodes_of
+
+DIRECT, DIRECT_DEPTH = "DirectIntegrator", 2
+"""Class of an integrator without the property ``max_depth``, and the length of its paths."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +25,18 @@ class Limits:
 
 
 def read_limits(integrator: mi.Integrator) -> Limits | None:
-    """Read the limits of any integrator; None if its path length cannot be read."""
+    """Read the limits of any integrator; None if its path length cannot be read.
+
+    The limits of an integrator that contains another one (Mitsuba's ``aov``, ``moment``) are those of the other one.
+    """
+    known = isinstance(integrator, mi.Integrator)  # callers may not have checked what a user has given
+    inner = [node for node in nodes_of(integrator) if isinstance(node, mi.Integrator)] if known else []
+    if inner:
+        return read_limits(inner[0]) if len(inner) == 1 else None
     # Python integrators have attributes; C++ integrators only print the values.
     printed = dict(re.findall(r"(max_depth|rr_depth) = (-?\d+)", str(integrator)))
+    if known and integrator.class_name() == DIRECT:
+        printed["max_depth"] = str(DIRECT_DEPTH)
     max_depth = getattr(integrator, "max_depth", printed.get("max_depth"))
     rr_depth: Any = getattr(integrator, "rr_depth", printed.get("rr_depth", 5))
     if max_depth is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,22 @@ def test_a_job_without_integrator_has_the_depth_and_options_of_the_scenes() -> N
     ours = problem("pathreplay", options).integrator
     assert (ours.boundary, ours.adjoint, read_limits(ours)) == ("primary", "replay", Limits(2, 5, True))
     assert read_limits(problem(integrator={"type": "pathreplay"}).integrator) == Limits(6, 5, False)
+
+
+HIDDEN = '<boolean name="hide_emitters" value="true"/>'
+NESTED = f'<integrator type="path"><integer name="max_depth" value="3"/>{HIDDEN}</integrator>'
+
+
+@pytest.mark.parametrize(
+    ("own", "options", "depth"),
+    [("direct", HIDDEN, 2), ("aov", f'<string name="aovs" value="z:depth"/>{NESTED}', 3)],
+)
+def test_limits_of_integrators_without_limits_of_their_own(own: str, options: str, depth: int) -> None:
+    """Paths of `direct` have up to two segments. Limits of `aov` are those of the integrator in it."""
+    scene = re.sub("<integrator.*</integrator>", f'<integrator type="{own}">{options}</integrator>', SCENE, flags=re.S)
+    Path("scene.xml").write_text(scene)
+    found = build_problem(make_config(JOB), Path.cwd())
+    assert read_limits(found.integrator) == read_limits(found.judge) == Limits(depth, 5, True)
 
 
 def test_a_scene_without_a_bound_leaves_the_job_the_default_depth() -> None:
