@@ -143,5 +143,11 @@ def test_what_scenes_cannot_share_is_told() -> None:
         with pytest.raises(PathreplayError, match=words) as told:
             Problem.joint(problems)
         assert "\n" not in str(told.value)
+    absolute = Problem(room(), {WALL: GREY}, views(photos), loss="l1")
+    with pytest.raises(PathreplayError, match=r"'levenberg-marquardt' needs a sum of squares in all scenes, .* 'l1'"):
+        pathreplay.minimize(Problem.joint([one, absolute]), "levenberg-marquardt", progress=False)
+    smooth = Problem(room(), {WALL: GREY}, views(photos), loss="log")
+    with pytest.raises(PathreplayError, match="debias: loss = 'l1' is not smooth"):
+        pathreplay.minimize(Problem.joint([smooth, absolute]), debias=True, progress=False)
     with pytest.raises(PathreplayError, match="stages: joint problems do not support stages"):
         pathreplay.minimize(Problem.joint([one, fine]), stages=[{"iterations": 2}], progress=False)

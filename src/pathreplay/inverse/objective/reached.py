@@ -1,4 +1,7 @@
-"""Checks that the variables of each stage affect a view of this stage. The checks precede the first iteration."""
+"""Checks that the stages of a problem can be run, among them: their variables affect a view of the stage.
+
+The checks precede the first iteration.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,8 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import picture_shape
 from pathreplay.integrators.stateful import stateful
+from pathreplay.inverse.config.schema import CORNERED, PIXELWISE
+from pathreplay.inverse.losses.pixelwise import LOSSES, QUADRATIC
 from pathreplay.inverse.objective.stages import Part, parts_of, require_single_pixels, require_stages
 from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.response import RESPONSE
@@ -19,13 +24,32 @@ from pathreplay.inverse.problem.problem import Problem, scene_values, variables_
 def require_possible(problem: Problem) -> None:
     """Raise PathreplayError unless all stages of a problem can be run.
 
-    See `require_stages`, `require_single_pixels` and `require_reached`.
+    See `require_loss`, `require_stages`, `require_single_pixels` and `require_reached`.
     """
     for each in problem.scenes():
+        require_loss(each)
         require_stages(each)
         require_single_pixels(each)
         with problem.computing():
             require_reached(each)
+
+
+def require_loss(problem: Problem) -> None:
+    """Raise PathreplayError if the loss of one of several scenes does not suit the settings of all scenes.
+
+    The settings themselves were checked with the loss of the first scene.
+    """
+    config, name = problem.config, next((name for name, each in LOSSES.items() if each is problem.loss), "a function")
+    if config.optimizer.is_second_order and problem.loss not in QUADRATIC:
+        raise PathreplayError(
+            f"optimizer: type = '{config.optimizer.type}' needs a sum of squares in all scenes, which loss = '{name}' "
+            f"is not; use {' or '.join(PIXELWISE)}, or type = 'adam'"
+        )
+    if config.debias and name in CORNERED:
+        raise PathreplayError(
+            f"debias: loss = '{name}' is not smooth where image and target are equal; remove 'debias', or use a smooth "
+            "loss such as 'log' in all scenes"
+        )
 
 
 def require_reached(problem: Problem) -> None:
