@@ -153,6 +153,7 @@ def test_samples_follow_the_ratio() -> None:
     assert next_spp(auto, entries(WINDOW, 8, norm[2.5])) == 4
     assert next_spp(auto, entries(WINDOW, 4, norm[2.5])) == 4
     assert next_spp(auto, entries(WINDOW, 32, norm[0.5])) == 32
+    assert [next_spp(auto, entries(WINDOW, spp, norm[0.5])) for spp in (1, 9, 31, 48)] == [4, 8, 16, 32]
     for n in (WINDOW - 1, WINDOW + 1, 2 * WINDOW - 1):
         assert next_spp(auto, entries(n, 8, norm[0.5])) == 8
     assert next_spp(auto, entries(WINDOW, 8, 9.0) + entries(WINDOW - 1, 16, norm[0.5])) == 16

@@ -51,6 +51,7 @@ def next_spp(auto: AdaptiveSpp, history: Sequence[Entry]) -> int:
     if not history:
         return auto.min
     spp = min(max(history[-1].spp, auto.min), auto.max)
+    spp = 1 << (spp.bit_length() - 1)  # a stage with its own number may precede
     streak = next((n for n, entry in enumerate(reversed(history)) if entry.spp != spp), len(history))
     measured = ratios(history) if streak and streak % WINDOW == 0 else {}
     if not measured:
