@@ -615,6 +615,9 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
     assert textured.render({TEXTURE: np.zeros((8, 8, 3))}, spp=1).shape == (SIDE, SIDE, 3)
     with pytest.raises(PathreplayError, match="'iterations' is 0"):
         pathreplay.minimize(problem, steps=0, progress=False)
+    compared = Problem(room(), {WALL: GREY}, views(photos), baseline={"type": "prb"})
+    with pytest.raises(PathreplayError, match="optimizer: an object cannot step the baseline as well"):
+        pathreplay.minimize(compared, mi.ad.Adam(lr=0.1), steps=1, progress=False)
     with pytest.raises(PathreplayError, match="minimize: 'response' belongs to the problem; give it to Problem"):
         pathreplay.minimize(problem, response={"kind": "gamma"}, progress=False)
 

@@ -148,6 +148,11 @@ def _minimized(
             f"executor = '{built.config.executor}': objects in memory cannot be sent to other processes; create the "
             "problem with load_job"
         )
+    if own is not None and built.baseline is not None:
+        raise PathreplayError(
+            "optimizer: an object cannot step the baseline as well; give the name of an optimizer or a mapping, or "
+            "remove 'baseline'"
+        )
     with ExitStack() as stack:
         stack.enter_context(memory.within(built.config.budget))
         require_executor(built.config)
