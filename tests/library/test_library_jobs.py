@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,26 @@ def test_a_file_gives_the_bits_of_its_job(kind: str, place: Path) -> None:
             np.testing.assert_array_equal(result.values[key], value)
     assert checkpoint_bits(Path("run")) == checkpoint_bits(Path("job"))
     assert "optimize(load_config(" in Path("run/report.html").read_text()
+
+
+OF_GREY = """
+from pathlib import Path
+import pathreplay, mitsuba as mi
+from pathreplay.output.export import export_run
+mi.set_variant("llvm_ad_mono")
+pathreplay.minimize(pathreplay.load_job("../jobs/job.json"), output="run", progress=False)
+mi.set_variant("llvm_ad_rgb")
+export_run(Path("run"))
+"""
+
+
+def test_a_run_tells_the_command_line_its_variant(place: Path, run_python: Callable[..., Any]) -> None:
+    """The job names none: then it is the active one, which the command line would not choose."""
+    written(place, {**JOB, "iterations": 1, "parameters": [{"key": KEY}], "target": {"values": {KEY: 0.4}, "spp": 2}})
+    done = run_python(OF_GREY)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(Path("run/config.json").read_text())["variant"] == "llvm_ad_mono"
+    assert json.loads(Path("run/export/values.json").read_text()).keys() == {KEY}
 
 
 def test_python_and_the_command_line_go_on_with_each_others_runs(place: Path) -> None:

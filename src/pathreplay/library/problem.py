@@ -112,6 +112,7 @@ class Problem:
         self.notes: tuple[str, ...] = ()
         if mi.variant() is None or "variant" in job:
             backend.set_variant(job.get("variant"))
+        job["variant"] = mi.variant()  # for runs that are resumed or exported by the command line
         wanted = None if parameters is None else by_key(parameters)
         looked_at = None if views is None else [views] if isinstance(views, View) else list(views)
         require_kinds(wanted or {}, looked_at or (), derived or {})
