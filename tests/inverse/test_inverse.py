@@ -120,6 +120,16 @@ def test_config_of_the_example_is_valid() -> None:
 MINIMAL = {"scene": "cornell-box", "parameters": [{"key": "a"}], "target": {"images": ["t.exr"]}}
 BAD_CONFIGS = {
     "unknown key": ({"iteration": 3}, "unknown key 'iteration'; did you mean 'iterations'?"),
+    "a key of the library": ({"steps": 3}, "unknown key 'steps'; did you mean 'iterations'?"),
+    "bounds as in the library": (
+        {"parameters": [{"key": "a", "bounds": [0, 1]}]},
+        "unknown key 'parameters.0.bounds'; did you mean 'lower' and 'upper'?",
+    ),
+    "a key of the job in a table": (
+        {"optimizer": {"type": "adam", "lr": 0.1}},
+        "'optimizer.lr'; 'learning_rate' is a key of the job, not of 'optimizer'",
+    ),
+    "a key of a table in the job": ({"masks": ["m.png"]}, "unknown key 'masks'; it is a key of 'target'"),
     "resolutions without iterations": (
         {"parameters": [{"key": "a", "resolutions": [8, 16]}]},
         "'a': 2 resolutions and 0 entries in refine_at",

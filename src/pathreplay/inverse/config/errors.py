@@ -64,6 +64,20 @@ RENAMED = {
     "memory": "memory_limit history_size",
 }
 
+# Names that the library or other programs use, and the names here. They are too different for a comparison of letters.
+_SYNONYMS = {
+    "bounds": "lower upper",
+    "range": "lower upper",
+    "lr": "learning_rate",
+    "steps": "iterations",
+    "epochs": "iterations",
+    "views": "sensors",
+    "max_depth": "integrator.max_depth",
+    "resolution": "scene_parameters.resolution",
+}
+_WITH_OWN_KEYS = ("target", "parameters", "capture")
+"""Tables whose keys are recognised at the top of a job."""
+
 
 def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[str, type[BaseModel]]) -> str:
     """Describe one error of a job in a single line: location, value and remedy. An unknown key has precedence.
@@ -82,9 +96,7 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
         table = next((tables[str(part)] for part in reversed(first["loc"][:-1]) if part in tables), job)
         if (new := _renamed(key, table)) is not None:
             return f"unknown key '{where}'; it is called '{new}' now"
-        close = difflib.get_close_matches(key, table.model_fields, n=1, cutoff=0.4)
-        hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(table.model_fields)}"
-        return f"unknown key '{where}'; {hint}"
+        return f"unknown key '{where}'; {_hint(key, table, job, tables)}"
     if first["type"] == "missing":
         return f"key '{where}' is missing; add it"
     if first["type"] == "value_error":
@@ -97,6 +109,27 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
         return f"'{where}' is {shown(first['input'])}; write {kinds}"
     instead = _INSTEAD.get(first["type"])
     return f"'{where}' is {shown(first['input'])}: {first['msg'].lower()}" + (f"; {instead}" if instead else "")
+
+
+def _hint(key: str, table: type[BaseModel], job: type[BaseModel], tables: Mapping[str, type[BaseModel]]) -> str:
+    """Name the key that was meant by an unknown key of ``table``, or list the known keys."""
+    others = _SYNONYMS.get(key, "").split()
+    if meant := [name for name in others if name.partition(".")[0] in table.model_fields]:
+        return f"did you mean {' and '.join(repr(name) for name in meant)}?"
+    if close := difflib.get_close_matches(key, table.model_fields, n=1, cutoff=0.75):
+        return f"did you mean '{close[0]}'?"
+    if of_job := next((name for name in [key, *others] if name in job.model_fields), None):
+        return f"'{of_job}' is a key of the job, not of '{_name_of(table, tables)}'"
+    owner = next((name for name in _WITH_OWN_KEYS if key in tables[name].model_fields), None)
+    if owner is not None and table is job:
+        return f"it is a key of '{owner}'"
+    close = difflib.get_close_matches(key, table.model_fields, n=1, cutoff=0.4)
+    return f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(table.model_fields)}"
+
+
+def _name_of(table: type[BaseModel], tables: Mapping[str, type[BaseModel]]) -> str:
+    """Return the name of a table in messages."""
+    return next((name for name, each in tables.items() if each is table), "this table")
 
 
 def _renamed(key: str, table: type[BaseModel]) -> str | None:
