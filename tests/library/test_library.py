@@ -462,6 +462,17 @@ def test_a_callback_ends_it_and_nothing_is_written(photos: list[np.ndarray], tmp
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_callback_may_stand_alone_and_compare_arrays(photos: list[np.ndarray]) -> None:
+    """The comparison returns a boolean of NumPy. Other results do not end the run."""
+    problem = Problem(room(), {WALL: GREY}, views(photos))
+
+    def steps(callback: Callable[[pathreplay.Iteration], object]) -> int:
+        return len(pathreplay.minimize(problem, steps=3, callbacks=callback, progress=False).history)
+
+    assert steps(lambda it: it.values[WALL].max() > 0) == 1
+    assert steps(lambda it: it.values[WALL]) == steps(lambda it: 1) == 3
+
+
 def test_stages_take_the_place_of_steps(photos: list[np.ndarray]) -> None:
     problem = Problem(room(), {WALL: GREY, TEXTURE: Parameter(resolutions=[2, 4], refine_at=[2])}, views(photos))
     stages = [{"iterations": 2, "downscale": 2, "parameters": [WALL]}, {"iterations": 3, "max_depth": 2}]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from pathreplay.distributed.ray_executor import crew_of, require_executor
 from pathreplay.errors import PathreplayError
@@ -74,7 +75,7 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
     optimizer: str | Mapping[str, object] | Stepper | object = None,
     steps: int | None = None,
     *,
-    callbacks: Iterable[Callable[[Iteration], object]] = (),
+    callbacks: Callable[[Iteration], object] | Iterable[Callable[[Iteration], object]] = (),
     progress: bool = True,
     output: str | Path | None = None,
     resume: bool = False,
@@ -98,7 +99,8 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
             ``functools.partial(scipy.optimize.minimize, method="SLSQP")``. It supports parameters with up to 1000
             entries in total.
         steps: number of iterations. Default: ``iterations`` of the problem's job, or 200.
-        callbacks: functions that are called with an `Iteration` after each step; one that returns True stops the loop.
+        callbacks: a function or several, called with an `Iteration` after each step; one that returns True (also of
+            NumPy) stops the loop.
         progress: show a bar on a terminal, the loss curve and images in a notebook, or lines elsewhere.
         output: run folder for checkpoints, the page of ``pathreplay watch`` and the report. If the folder exists, a
             number is appended. Default: no files are written.
@@ -129,7 +131,8 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         "pixel_batch_size": pixel_batch_size,
     }
     built = problem.configured(run_settings("minimize", steps, options, settings), "minimize")
-    return _minimized(problem, built, own, list(callbacks), progress, None if output is None else Path(output), resume)
+    observers = [callbacks] if callable(callbacks) else list(callbacks)
+    return _minimized(problem, built, own, observers, progress, None if output is None else Path(output), resume)
 
 
 def _minimized(
@@ -180,7 +183,7 @@ def _minimized(
         # files, for which Mitsuba needs two threads.
         with one_thread(built.config.deterministic and not callbacks):
             for about in stack.enter_context(closing(iterations(built, run, stop, observers, kept))):
-                if any([callback(about) is True for callback in callbacks]):
+                if any([_is_true(callback(about)) for callback in callbacks]):
                     stop.by = stop.by or "a callback"
         if kept is not None:
             bar.say("writing")
@@ -191,6 +194,11 @@ def _minimized(
             put_values(built, {v.key: found[v.key] for v in built.variables})
     folder = None if kept is None else kept.folder.path
     return Result(found, run.history, stop.by or run.optimiser.finished or None, problem, folder)
+
+
+def _is_true(value: object) -> bool:
+    """Return whether a callback's result is True. Comparisons of arrays are booleans of NumPy."""
+    return isinstance(value, (bool, np.bool_)) and bool(value)
 
 
 def _run(problem: Problem, built: inner.Problem, own: object, stack: ExitStack, bar: Progress | NotebookPanel) -> Run:
