@@ -579,6 +579,8 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(views=View("middle", np.zeros((16, 16, 3)))), "No sensor 'middle'"),
         (bad(views=[View(0, np.zeros((16, 16, 3))), View("left", np.zeros((16, 16, 3)))]), "is named twice"),
         (bad(views=View(0, np.full((16, 16, 3), np.nan))), "NaN"),
+        (bad(views=View(0, np.zeros((16, 16, 3), np.uint8))), r"array of uint8, .* give mi.Bitmap\(array\)"),
+        (bad(views=View(0, PIL.Image.new("RGB", (16, 16)))), "array of uint8"),
         (bad(views=View(0, np.zeros((16, 16, 3)), weight=np.zeros((16, 16)))), "is black"),
         (bad(views=View(0, np.zeros((16, 16, 3)), weight=np.ones((3, 4)))), r"\(3, 4, 1\); give \(16, 16\)"),
         (bad(target={"alpha": "mask"}), "'target' would be replaced by 'views'; use View\\(target"),

@@ -89,7 +89,8 @@ class View:
     Args:
         sensor: index or id of the sensor.
         target: linear pixels (height, width, channels): a NumPy or Dr.Jit array, a `mi.Bitmap`, or an image file.
-            Bitmaps and files are decoded from sRGB if they have 8 or 16 bits, and composited over black.
+            Bitmaps and files are decoded from sRGB if they have 8 or 16 bits, and composited over black. Arrays of
+            8- or 16-bit integers are refused, because their encoding is unknown.
         weight: nonnegative pixel weights (height, width), normalised to mean 1: an array, a `mi.Bitmap` or an image
             file. The stored values of bitmaps and files are used, without decoding; colours are converted to luminance.
             Default: equal weights.

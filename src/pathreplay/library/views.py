@@ -67,9 +67,15 @@ def _pixels(what: str, value: object, *, stored: bool = False) -> Image:
     if value is None:
         raise PathreplayError(f"{what} is missing; give an array, a mi.Bitmap or a file")
     try:
-        image = np.array(value, np.float32)
+        plain = np.asarray(value)
+        image = np.array(plain, np.float32)
     except (TypeError, ValueError) as error:
         raise PathreplayError(f"{what} is not an image ({error}); give an array, a mi.Bitmap or a file") from None
+    if not stored and plain.dtype in (np.uint8, np.uint16):
+        raise PathreplayError(
+            f"{what} is an array of {plain.dtype}, whose encoding is unknown; give mi.Bitmap(array), which is decoded "
+            "from sRGB, or an array of linear floats"
+        )
     image = image[:, :, None] if image.ndim == 2 else image
     if image.ndim != 3:
         raise PathreplayError(f"{what} has the shape {image.shape}; give (height, width, channels)")
