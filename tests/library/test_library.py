@@ -590,6 +590,9 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(integrator={"type": "path"}), "computes no gradients"),
         (bad(spp=0), "problem: 'spp' is 0"),
         (bad(parameters={WALL: Parameter(bounds=(1, 0))}), "is not above lower bound"),
+        (bad(parameters={WALL: Parameter(bounds=1)}), r"'wall.*': bounds are 1; give \(lower, upper\)"),
+        (bad(parameters={WALL: Parameter(bounds=(0, 1, 2))}), r"bounds are \(0, 1, 2\)"),
+        (bad(parameters={WALL: Parameter(initial=Path("no.exr"))}), "is the image 'no.exr', but"),
         (bad(parameters={WALL: Parameter(initial=np.zeros(5))}), "of shape \\(5,\\)"),
         (bad(parameters={WALL: Parameter(parameterization="cube")}), "parameterization"),
         (bad(parameters={BODY: Parameter(pose="rigid", initial=np.eye(4))}), "'initial' of a pose is a displacement"),
@@ -620,6 +623,10 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
             pathreplay.minimize(problem, optimizer, progress=False)
     with pytest.raises(PathreplayError, match="No parameter 'x'"):
         problem.render({"x": 1.0})
+    with pytest.raises(PathreplayError, match="is 'red'; give an array of numbers"):
+        problem.render({WALL: "red"})
+    with pytest.raises(PathreplayError, match="is not a scene of the active variant"):
+        problem.assign(problem.initial, room())
     with pytest.raises(PathreplayError, match=r"has the shape \(2,\), not the shape \(3,\); reshape it"):
         pathreplay.value_and_grad(problem)({WALL: [1.0, 2.0]})
     textured = Problem(room(), [TEXTURE], views(photos))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -147,11 +148,14 @@ class Objects:
         return name
 
     def tables(self, wanted: Mapping[str, Parameter | None]) -> list[Json]:
-        """Convert parameters to tables. Raises PathreplayError if the initial value of a pose is an array."""
+        """Convert parameters to tables.
+
+        Raises PathreplayError if the initial value of a pose is an array, or bounds are no pair.
+        """
         return [self._table(key, entry or Parameter()) for key, entry in wanted.items()]
 
     def _table(self, key: str, entry: Parameter) -> Json:
-        lower, upper = entry.bounds
+        lower, upper = _pair(key, entry.bounds)
         table = {"key": key, "lower": lower, "upper": upper}
         table |= {each.name: getattr(entry, each.name) for each in fields(Parameter) if each.name != "bounds"}
         if entry.regularizer is not None:
@@ -181,14 +185,23 @@ class Objects:
         return tables
 
 
+def _pair(key: str, bounds: object) -> tuple[object, object]:
+    """Return the lower and the upper bound. Raises PathreplayError unless there are two bounds."""
+    if isinstance(bounds, Iterable) and len(pair := list(bounds)) == 2:
+        return pair[0], pair[1]
+    raise PathreplayError(f"Parameter '{key}': bounds are {shown(bounds)}; give (lower, upper), where None is no bound")
+
+
 def _plain_table(table: Mapping[str, object]) -> Json:
     return {name: _plain(value) for name, value in table.items()}
 
 
 def _plain(value: object) -> object:
-    """Convert arrays and NumPy scalars to lists and numbers."""
+    """Convert arrays, NumPy scalars and paths to lists, numbers and strings."""
     if isinstance(value, (str, Mapping)):
         return value
+    if isinstance(value, Path):
+        return str(value)
     if isinstance(value, Iterable):
         return [_plain(each) for each in value]
     return value.item() if isinstance(value, np.generic) else value

@@ -60,8 +60,8 @@ class Result:
     def apply(self, scene: mi.Scene) -> None:
         """Set the parameters of a scene to the resulting values, which the problem's own scene already has.
 
-        Raises PathreplayError if the scene lacks a parameter, or stores it such that it cannot have the values. Load
-        8-bit textures with ``format = 'variant'``.
+        Raises PathreplayError if this is not a `mi.Scene`, lacks a parameter, or stores it such that it cannot have the
+        values. Load 8-bit textures with ``format = 'variant'``.
         """
         self.problem.assign(self.values, scene)
 

@@ -252,8 +252,11 @@ class Problem:
     def assign(self, values: Arrays, scene: mi.Scene) -> None:
         """Set the parameters of a scene to these values.
 
-        Raises PathreplayError if the scene lacks a parameter, or stores it such that it cannot have the values.
+        Raises PathreplayError if this is not a `mi.Scene`, lacks a parameter, or stores it such that it cannot have the
+        values.
         """
+        if not isinstance(scene, mi.Scene):
+            raise PathreplayError(f"{shown(scene)} is not a scene of the active variant, {mi.variant()}; load it first")
         params, known = traversed(scene), self.built.scenes()
         found = [inner.scene_values(each, inner.variables_of(each, values)) for each in known]
         fitting = [each for each in found if each.keys() <= set(params.keys())]
@@ -316,7 +319,10 @@ def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
     if dr.is_array_v(value):
         points = not dr.is_tensor_v(value) and dr.depth_v(value) > 1 and len(wanted) == 1
         value = get_array(dr.ravel(value) if points else value)
-    array = np.array(value, np.float32)
+    try:
+        array = np.array(value, np.float32)
+    except (TypeError, ValueError):
+        raise PathreplayError(f"Value of '{key}' is {shown(value)}; give an array of numbers") from None
     resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
     rows = len(wanted) == 1 and array.size == wanted[0]
     of_vertices = key.rpartition(".")[2].startswith("vertex_")
