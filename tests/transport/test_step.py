@@ -247,6 +247,46 @@ def test_a_given_radiance_comes_back() -> None:
     assert np.allclose(found, 3 * 2.0 * LANES, rtol=1e-5)
 
 
+class OwnMirror(mi.BSDF):
+    """A BSDF as in Mitsuba's tutorial on plugins: its methods have no defaults, because Mitsuba passes ``active``."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        mi.BSDF.__init__(self, props)
+        self.tint = mi.Color3f(props["tint"])
+        self.m_flags = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide
+        self.m_components = [self.m_flags]
+
+    def sample(self, ctx, si, sample1, sample2, active):
+        sample = dr.zeros(mi.BSDFSample3f)
+        sample.pdf, sample.eta, sample.wo = mi.Float(1), mi.Float(1), mi.reflect(si.wi)
+        sample.sampled_type = mi.UInt32(+mi.BSDFFlags.DeltaReflection)
+        return sample, self.tint & active
+
+    def eval(self, ctx, si, wo, active):
+        return 0.0
+
+    def pdf(self, ctx, si, wo, active):
+        return 0.0
+
+    def eval_pdf(self, ctx, si, wo, active):
+        return 0.0, 0.0
+
+    def traverse(self, cb):
+        cb.put("tint", self.tint, mi.ParamFlags.Differentiable)
+
+
+def test_a_bsdf_of_python_needs_no_defaults() -> None:
+    mi.register_bsdf("own_mirror", OwnMirror)
+    world = scene({"type": "own_mirror", "tint": [0.8, 0.8, 0.8]})
+    params = mi.traverse(world)
+    dr.enable_grad(params["square.bsdf.tint"])
+    params.update()
+    assert np.allclose(back(world, 2.0, RayDerivative.zero(), 1.0), 1.6, rtol=1e-5)
+    assert np.allclose(dr.grad(params["square.bsdf.tint"]), 2.0 * LANES, rtol=1e-5)
+    params["square.bsdf.tint"] = dr.detach(params["square.bsdf.tint"])
+    params.update()
+
+
 @pytest.mark.parametrize(
     ("adjoint", "move", "expected"),
     [

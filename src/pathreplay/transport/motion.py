@@ -86,7 +86,7 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
         # For `edges_move`, ``painted`` is False, and smooth lobes that are sampled attached are ignored. Boundary terms
         # need attach = 'delta'. Smooth lobes are then sampled attached only in scenes without outlines.
         for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ()):
-            sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
+            sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5), mi.Bool(True))
             moving.append(sample.wo)
         light, _ = trace.scene.sample_emitter_direction(still, mi.Point2f(0.5), False)
         moving += [light.p, light.d, light.pdf]
