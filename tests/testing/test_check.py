@@ -49,6 +49,7 @@ def verdict_on(g: float, r: float, noise: float, n: int = 16, halving: float = 0
         ({"g": -1.0, "r": 1.0, "noise": 0.2}, "fail"),
         ({"g": 0.0, "r": 1e-3, "noise": 1e-5}, "fail"),  # a missing derivative, however small
         ({"g": 1.0, "r": 1.0, "noise": 2.0}, "inconclusive"),
+        ({"g": -1.0, "r": 0.1, "noise": 0.05, "n": 2}, "inconclusive"),  # 20 σ apart, and yet below |z| = 4
         ({"g": 0.0, "r": 0.0, "noise": 1.0}, "inconclusive"),
         ({"g": 0.0, "r": 0.0, "noise": 0.0}, "zero"),
         ({"g": 0.0, "r": 0.0, "noise": 1e-6, "negligible": 1e-3}, "zero"),

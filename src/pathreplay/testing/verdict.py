@@ -69,8 +69,9 @@ def judge(
     a derivative counts as zero.
 
     The gradient *fails* if |z| >= 4 or if it is not finite. Otherwise it *passes* if σ is at most a tenth of the
-    larger mean. Otherwise it passes as *zero* if both means are within 4 σ of zero and 4 σ is at most ``negligible``.
-    Otherwise the noise is too large and the check is *inconclusive*.
+    larger mean, and the means differ by at most four tenths of it: with few samples, |z| may be below 4 although they
+    differ by many σ. Otherwise it passes as *zero* if both means are within 4 σ of zero and 4 σ is at most
+    ``negligible``. Otherwise the noise is too large and the check is *inconclusive*.
     """
     with np.errstate(invalid="ignore"):  # samples that are NaN or infinite are handled below
         reference = (4 * half_step - full_step) / 3
@@ -94,6 +95,8 @@ def judge(
     if abs(z) >= Z_LIMIT:
         ratio = "differs from a reference of zero" if r == 0 else f"differs: {g / r:.4g} times the reference"
         verdict, reason = "fail", ratio
+    elif resolution <= RESOLUTION and abs(g - r) > Z_LIMIT * RESOLUTION * scale:
+        verdict, reason = "inconclusive", f"{gradient.size} seeds are too few for this difference; use more --seeds"
     elif resolution <= RESOLUTION:
         verdict, reason = "pass", f"agrees; an error above {100 * Z_LIMIT * resolution:.2g} % would have shown"
     elif scale <= Z_LIMIT * σ <= negligible or scale == σ == 0:
