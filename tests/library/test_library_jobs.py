@@ -97,6 +97,8 @@ def test_python_and_the_command_line_go_on_with_each_others_runs(place: Path) ->
     assert optimize(resume="begun-here", progress=False).iterations == 8
     for name in ("begun-there", "begun-here"):
         assert checkpoint_bits(Path(name)) == checkpoint_bits(Path("whole"))
+    with pytest.raises(PathreplayError, match=r"all its 8 iterations; .* \(Python: 'steps'\)"):
+        pathreplay.minimize(load_job(path), output="whole", resume=True, progress=False)
 
 
 def test_what_a_file_says_can_be_changed(place: Path) -> None:
