@@ -158,6 +158,7 @@ def test_what_cannot_go_on_is_told_in_one_line(photos: list[np.ndarray]) -> None
     told("has the parameters", Problem(room(), {WALL: GREY}, views(photos), spp=4))
     told("is not a state array of this optimizer", optimizer="sgd")
     told("'loss' belongs to the problem; give it to Problem", loss="l1")
+    told("'response' belongs to the problem; give it to Problem", response={"kind": "gamma"})
     told("unknown key 'checkpoint_evry'; did you mean 'checkpoint_every'", checkpoint_evry=3)
     told("'iterations' is called 'steps' here", iterations=3)
     told("executor = 'ray': objects in memory cannot be sent", executor="ray", output=None, resume=False)
