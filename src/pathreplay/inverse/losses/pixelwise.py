@@ -111,8 +111,16 @@ def mean_loss(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weight: mi.Te
 
     Returns:
         A tensor with one entry.
+
+    Raises:
+        PathreplayError: the loss function returns one number, which cannot be weighted by pixels.
     """
     values = loss(image, target, weight) if loss in WEIGHTED else loss(image, target)
+    if weight is not None and values.shape in ((), (1,)):
+        raise PathreplayError(
+            f"{loss} returns one number, but masks or weights of pixels need a tensor of shape {image.shape}; return "
+            "the loss of each pixel and channel, or leave the masks and weights out"
+        )
     return dr.mean(values if weight is None else values * weight, axis=None)
 
 
