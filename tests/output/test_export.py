@@ -229,6 +229,11 @@ def test_a_value_that_does_not_come_back_is_told(tmp_path: Path) -> None:
         ({"type": "pathreplay"}, {"type": "path", "max_depth": 6}),
         ({"type": "pathreplay", "max_depth": 3, "boundary": "all"}, {"type": "path", "max_depth": 3}),
         ({"type": "direct_projective", "sppi": 0}, {"type": "path", "max_depth": 2}),
+        (
+            {"type": "pathreplay_particles", "max_depth": 4, "boundary": "none"},
+            {"type": "ptracer", "max_depth": 4},
+        ),
+        ({"type": "pathreplay_particles"}, {"type": "ptracer", "max_depth": 6}),
         ({"type": "direct", "emitter_samples": 2}, {"type": "direct", "emitter_samples": 2}),
         (None, {"type": "path", "max_depth": 8}),
     ],

@@ -34,12 +34,13 @@ SCENE = "scene.xml"
 
 _STANDS_IN = {"dielectric_ad": "dielectric"}
 """Mitsuba's equivalents of our plugins."""
+_PARTICLES = "pathreplay_particles"
 _DEPTHS = {"direct_projective": 2} | dict.fromkeys(
-    ("pathreplay", "prb", "prb_basic", "prb_projective", "rb", "prbvolpath"), 6
+    ("pathreplay", _PARTICLES, "prb", "prb_basic", "prb_projective", "rb", "prbvolpath"), 6
 )
-"""Differentiable integrators and their default depths. Exported scenes have `path` or `volpath` instead."""
+"""Differentiable integrators and their default depths. Exported scenes have `path`, `volpath` or `ptracer` instead."""
 _KEPT = ("max_depth", "rr_depth", "hide_emitters")
-"""Properties that `path` and `volpath` share with differentiable integrators."""
+"""Properties that `path`, `volpath` and `ptracer` share with differentiable integrators."""
 
 # Name that Mitsuba gives to an object without id; the number is a memory address.
 _ADDRESS = re.compile(r"object_\d+")
@@ -93,7 +94,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
         source: the scene.
         values: decoded values by parameter key.
         integrator: dictionary of the integrator; default: the scene's integrator, or `pathreplay` if the scene has
-            none. `path` or `volpath` replaces a differentiable integrator.
+            none. `path`, `volpath` or `ptracer` replaces a differentiable integrator.
 
     Returns:
         The scene with these values, and the content of its files.
@@ -199,7 +200,8 @@ def _plain_plugins(described: Described) -> list[str]:
 def _plain_integrator(described: Described, wanted: Mapping[str, object] | None) -> list[str]:
     """Set the ``wanted`` integrator; default: the scene's, or `pathreplay` if the scene has none.
 
-    `path` or `volpath` replaces a differentiable integrator; a returned note says so.
+    `ptracer` replaces `pathreplay_particles`, and `path` or `volpath` other differentiable integrators; a returned note
+    says so.
     """
     root = described.nodes[0]
     children = dict(described.children(root))
@@ -216,7 +218,8 @@ def _plain_integrator(described: Described, wanted: Mapping[str, object] | None)
     if wanted is None and own is not None and depth is None:
         return []
     media = any(node.type == mi.ObjectType.Medium for node in described.nodes)
-    properties = mi.Properties(name if depth is None else "volpath" if media else "path")
+    plain = "ptracer" if name == _PARTICLES else "volpath" if media else "path"
+    properties = mi.Properties(name if depth is None else plain)
     if depth is not None:
         options = {"max_depth": depth, **{option: value for option, value in options.items() if option in _KEPT}}
     for option, value in options.items():
