@@ -6,6 +6,7 @@ import inspect
 import re
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 import pathreplay
+from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.platform.registration import BASELINES, PLUGINS
 from places import ROOT
 
@@ -143,6 +145,12 @@ def test_options_of_integrators_are_declared(name: str) -> None:
     options = integrator.options()
     assert {key for key, value in options.items() if declared.get(key) not in (None, value)} == set()
     assert options.keys() - declared.keys() == ({"caustics"} if name == "pathreplay_particles" else set())
+
+
+def test_the_keys_of_a_line_of_the_history_are_those_on_the_page() -> None:
+    page = (DOCS / "optimize.md").read_text(encoding="utf-8")
+    (told,) = re.findall(r"^\| `history\.jsonl` \| (.*) \|$", page, re.MULTILINE)
+    assert set(re.findall(r"`([a-z_]+)`", told)) == {each.name for each in fields(Entry)}
 
 
 def test_every_public_name_is_in_the_reference() -> None:
