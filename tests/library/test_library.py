@@ -546,6 +546,31 @@ def test_an_iteration_that_is_kept_stays_as_it_was(make: Callable[[], Any], phot
     assert len({float(it.values[WALL][0]) for it in kept}) == 4
 
 
+class Foreign:
+    """An array of another framework: NumPy can convert it, and its elements are such arrays, too."""
+
+    def __init__(self, values: Any) -> None:
+        self.values = np.array(values)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return self.values.astype(dtype or self.values.dtype)
+
+    def __iter__(self) -> Any:
+        return iter([Foreign(each) for each in self.values])
+
+
+def test_initial_values_are_what_numpy_can_convert(photos: list[np.ndarray]) -> None:
+    start = np.random.default_rng(0).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
+    colour, grey = np.float32([0.1, 0.2, 0.3]), np.full(3, 0.5, np.float32)
+    for texture, wall, seen in ((Foreign(start), Foreign(colour), colour), (start.tolist(), Foreign(0.5), grey)):
+        wanted = {TEXTURE: Parameter(initial=texture), WALL: Parameter(initial=wall)}
+        problem = Problem(room(), wanted, views(photos))
+        np.testing.assert_array_equal(problem.initial[TEXTURE], start)
+        np.testing.assert_array_equal(problem.initial[WALL], seen)
+    with pytest.raises(PathreplayError, match="'initial' is not an array"):
+        Problem(room(), {TEXTURE: Parameter(initial=[[1.0], [1.0, 2.0]])}, views(photos))
+
+
 def test_weights_shares_and_test_views(photos: list[np.ndarray]) -> None:
     mask = np.zeros((SIDE, SIDE))
     mask[:8] = 1

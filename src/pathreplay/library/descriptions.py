@@ -160,9 +160,11 @@ class Objects:
         table |= {each.name: getattr(entry, each.name) for each in fields(Parameter) if each.name != "bounds"}
         if entry.regularizer is not None:
             table["regularizer"] = self.named(entry.regularizer)
-        if isinstance(entry.initial, np.ndarray) or dr.is_array_v(entry.initial):
-            given = get_array(entry.initial) if dr.is_array_v(entry.initial) else entry.initial
-            self.starts[key] = np.array(given, np.float32)
+        given = _array(key, entry.initial)
+        if given is not None and given.ndim == 0:
+            table["initial"] = given.item()
+        elif given is not None:
+            self.starts[key] = given
             table["initial"] = None
             if entry.pose is not None:
                 raise PathreplayError(
@@ -190,6 +192,23 @@ def _pair(key: str, bounds: object) -> tuple[object, object]:
     if isinstance(bounds, Iterable) and len(pair := list(bounds)) == 2:
         return pair[0], pair[1]
     raise PathreplayError(f"Parameter '{key}': bounds are {shown(bounds)}; give (lower, upper), where None is no bound")
+
+
+def _array(key: str, value: object) -> Array | None:
+    """Convert an initial value to an array; None for numbers, lists of numbers, names of files and tables.
+
+    Raises PathreplayError if NumPy cannot convert the value.
+    """
+    if dr.is_array_v(value):
+        return np.array(get_array(value), np.float32)
+    nested = isinstance(value, (list, tuple)) and any(isinstance(each, (list, tuple)) for each in value)
+    if not nested and (isinstance(value, np.generic) or not hasattr(value, "__array__")):
+        return None
+    try:
+        return np.array(value, np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:
+        why = " ".join(str(error).split())
+        raise PathreplayError(f"Parameter '{key}': 'initial' is not an array ({why}); give a NumPy array") from None
 
 
 def _plain_table(table: Mapping[str, object]) -> Json:
