@@ -21,7 +21,7 @@ MAX_DEPTH = Property(
     "max_depth",
     "integer",
     6,
-    'Longest path in segments. 1 sees emitters only. -1 is unbounded, which requires `adjoint = "replay"`.',
+    "Longest path in segments. 1 sees emitters only. -1 is unbounded.",
 )
 RR_DEPTH = Property(
     "rr_depth",
@@ -98,7 +98,9 @@ CAUSTICS = Property(
 )
 PATHS: tuple[Property[object], ...] = (MAX_DEPTH, RR_DEPTH, HIDE_EMITTERS)
 PATH_REPLAY: tuple[Property[object], ...] = (
-    *PATHS,
+    replace(MAX_DEPTH, meaning=f'{MAX_DEPTH.meaning} Such paths are replayed; `adjoint = "recorded"` is refused.'),
+    RR_DEPTH,
+    HIDE_EMITTERS,
     ADJOINT,
     ATTACH,
     JACOBIAN_NOISE,

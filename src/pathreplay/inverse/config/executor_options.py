@@ -15,7 +15,8 @@ class RayOptions(Table):
     """The Ray cluster and its actors, for ``executor = "ray"``. These options do not change the results."""
 
     address: str | None = None
-    """Address of a running cluster, HOST:PORT or 'auto'; default: start a private cluster for this run."""
+    """Address of a running cluster, HOST:PORT or 'auto'; default: the variable RAY_ADDRESS, or a private cluster for
+    this run."""
     actors: Count | None = None
     """Number of actors; default: as many as fit on the cluster, at most one per shard of an iteration."""
     threads: Count | None = None
