@@ -19,7 +19,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
 from pathreplay.integrators.film.image import MOST_SAMPLES
-from pathreplay.integrators.term import TermResult
+from pathreplay.integrators.term import Term, TermResult
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import edges_move, moving_shapes
@@ -39,7 +39,7 @@ INNER_LENGTHS = 0.25, 0.1  # length of segments in the unit square of emitter sa
 
 
 @dataclass(frozen=True)
-class Boundary:
+class Boundary(Term):
     """The boundary term, for edges visible from the camera, from surfaces or from points in media.
 
     The camera may see an edge directly, in mirrors or through glass. Edges in textures and masks are not
@@ -77,10 +77,6 @@ class Boundary:
             paths += dr.width(edges.path.s)
         dr.eval()
         return TermResult(lost=lost.count, paths=paths, moves=True)
-
-    def note(self, trace: TraceConfig) -> str:
-        """Return "": this term has no notes."""
-        return ""
 
     @staticmethod
     def move(view: Pass, trace: TraceConfig) -> bool:

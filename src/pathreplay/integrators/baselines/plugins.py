@@ -17,7 +17,7 @@ from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.interior import back_propagate, tangent
 from pathreplay.integrators.path_integrator import PathIntegrator
 from pathreplay.integrators.properties import PATHS, choice, flag
-from pathreplay.integrators.term import TermResult
+from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.properties import Property
 from pathreplay.transport.vertex import TraceConfig
 
@@ -31,7 +31,7 @@ LINEAR = Property(
 
 
 @dataclass(frozen=True)
-class OtherInterior:
+class OtherInterior(Term):
     """The interior term of a baseline, computed by ``reverse_driver`` and ``forward_driver``.
 
     Media are differentiated with the score-function estimator, without a control variate. Empty voxels get no
@@ -48,10 +48,6 @@ class OtherInterior:
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         """Back-propagate the adjoint of the image: see `Term`."""
         return back_propagate(view, trace, grad_in, self.reverse_driver)
-
-    def note(self, trace: TraceConfig) -> str:
-        """Return "": this term has no notes."""
-        return ""
 
 
 class NaiveIntegrator(PathIntegrator):

@@ -42,7 +42,7 @@ from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.camera_flow import FilmFlow, Sample
 from pathreplay.integrators.film.domain import FilmPlaces
 from pathreplay.integrators.film.filter_samples import FilterSamples
-from pathreplay.integrators.term import TermResult
+from pathreplay.integrators.term import Term, TermResult
 from pathreplay.samplers.owen_sobol import OwenSobolSampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.start import CameraStart
@@ -71,7 +71,7 @@ class FlowPaths:
 
 
 @dataclass(frozen=True)
-class FilmMotion:
+class FilmMotion(Term):
     """The gradient term of a film flow. It does not differentiate motion of rays that the flow does not contain."""
 
     flow: FilmFlow
@@ -103,10 +103,6 @@ class FilmMotion:
             backward(δ * self._flow_factor(view, f))
         dr.eval()
         return TermResult()
-
-    def note(self, trace: TraceConfig) -> str:
-        """Return "": this term has no notes."""
-        return ""
 
     def _flow_factor(self, view: Pass, f: FlowPaths) -> mi.Float:
         """Return the factor by which the radiance of each path is multiplied.

@@ -12,7 +12,7 @@ from pathreplay.adjoint.baseline import Baseline
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.image import picture_shape
-from pathreplay.integrators.term import TermResult
+from pathreplay.integrators.term import Term, TermResult
 from pathreplay.particles.film import ParticleFilm
 from pathreplay.particles.paths import Particles, link_of, particle_image, particle_sweep, particle_tangent
 from pathreplay.particles.start import Emission
@@ -22,7 +22,7 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 @dataclass(frozen=True)
-class ParticleTerm:
+class ParticleTerm(Term):
     """Image and derivative of light paths. A pass traces as many light paths as it has samples.
 
     Every path is differentiated as in `PathReplay`, and also with respect to its film positions. The visibility of
@@ -64,10 +64,6 @@ class ParticleTerm:
         moves = particle_sweep(*work, grad_in, lost)
         dr.eval()
         return self._result(work[1], lost, moves)
-
-    def note(self, trace: TraceConfig) -> str:
-        """Return "": see `Term`."""
-        return ""
 
     def _work(self, view: Pass, trace: TraceConfig) -> tuple[TraceConfig, Particles, ParticleFilm] | None:
         emission = Emission.of(view.scene, view.sensor, self.caustics)
