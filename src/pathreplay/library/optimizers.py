@@ -37,7 +37,7 @@ class Stepper(Protocol):
 
 
 class OfMitsuba:
-    """An optimiser of `mitsuba.ad` or `drjit.opt`.
+    """`Optimiser` that is an object of `mitsuba.ad` or `drjit.opt`.
 
     Variables in ``own`` use their learning rates in the problem. Other variables use the optimiser's learning rate, to
     which the schedule and the stages of the problem apply as well. ``problem_rates`` are the learning rates of all
@@ -59,7 +59,6 @@ class OfMitsuba:
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
     ) -> dict[str, Array]:
-        """See `Optimiser`."""
         optimizer = self._optimizer
         known = optimizer.state
         for key, value in values.items():
@@ -85,7 +84,6 @@ class OfMitsuba:
         return found * (rate / self._problem_rates[key])
 
     def answer(self, values: Arrays) -> dict[str, Array]:
-        """See `Optimiser`."""
         return {}
 
     def state(self) -> State:
@@ -95,7 +93,6 @@ class OfMitsuba:
         return State(dict(self._steps), arrays)
 
     def restore(self, state: State, values: Arrays) -> None:
-        """See `Optimiser`."""
         arrays = dict(state.arrays)
         for key, value in values.items():
             self._optimizer[key] = mi.TensorXf(value)
@@ -126,7 +123,7 @@ def _with_leaves(tree: object, leaves: Iterator[dr.ArrayBase]) -> Any:
 
 
 class OfUser:
-    """An object with a step method: see `Stepper`."""
+    """`Optimiser` that is an object with a step method: see `Stepper`."""
 
     finished = ""
 
@@ -155,7 +152,6 @@ class OfUser:
         return stepped
 
     def answer(self, values: Arrays) -> dict[str, Array]:
-        """See `Optimiser`."""
         return {}
 
     def state(self) -> State:

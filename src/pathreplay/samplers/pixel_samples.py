@@ -36,16 +36,14 @@ class PixelSamples(Protocol):
 
 @dataclass(frozen=True)
 class IndependentSets:
-    """Samples from a Mitsuba sampler. All samples are independent, so that each set consists of a single path."""
+    """`PixelSamples` from a Mitsuba sampler. All samples are independent: each set consists of a single path."""
 
     sampler: mi.Sampler
 
     def together(self, paths: int) -> int:
-        """See `PixelSamples`."""
         return 1
 
     def first(self) -> Sampler:
-        """See `PixelSamples`."""
         return self.sampler
 
     def of(self, before: Sampler, place: mi.UInt32, size: int, number: mi.UInt32) -> Sampler:
@@ -55,19 +53,16 @@ class IndependentSets:
 
 @dataclass(frozen=True)
 class SobolSets:
-    """Low-discrepancy samples, in up to `SETS` sets."""
+    """`PixelSamples` of low discrepancy, in up to `SETS` sets."""
 
     sampler: Callable[[mi.UInt32, int, mi.UInt32], Sampler]
     """Maps index in the set, size of the set and index of the set to a sampler."""
 
     def together(self, paths: int) -> int:
-        """See `PixelSamples`."""
         return -(-paths // min(SETS, paths))
 
     def first(self) -> Sampler:
-        """See `PixelSamples`."""
         return self.sampler(mi.UInt32(0), 1, mi.UInt32(0))
 
     def of(self, before: Sampler, place: mi.UInt32, size: int, number: mi.UInt32) -> Sampler:
-        """See `PixelSamples`."""
         return self.sampler(place, size, number)

@@ -119,7 +119,6 @@ class CameraFlow:
         return CameraFlow(sensor, _distance(scene, sensor), rest, alone)
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """See `FilmFlow`."""
         ray, weight = sample.ray(self.sensor)
         if dr.grad_enabled(sample.position) or not dr.grad_enabled(ray.o, ray.d):
             return ray, weight
@@ -130,11 +129,9 @@ class CameraFlow:
         return ray, weight
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
-        """See `FilmFlow`."""
         return self._velocity(sample.ray(self.sensor)[0], ray_derivatives(self.sensor, sample))
 
     def divergence(self, sample: Sample) -> mi.Float:
-        """See `FilmFlow`."""
         total = mi.Float(0)
         for axis, step in enumerate((mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP))):
             before, after = (self.velocity(sample.at(sample.position + side * step))[axis] for side in (-1, 1))

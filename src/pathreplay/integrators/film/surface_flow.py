@@ -102,19 +102,16 @@ class SurfaceFlow:
         return SurfaceFlow(sensor, nodes, flows)
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """See `FilmFlow`."""
         ray, weight = sample.ray(self.sensor)
         if not dr.grad_enabled(sample.position) and dr.grad_enabled(self.nodes):
             move_with_position(ray, ray_derivatives(self.sensor, sample), self.velocity(sample))
         return ray, weight
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
-        """See `FilmFlow`."""
         (a, b, c, d), f = self._corners(sample.position)
         return dr.lerp(dr.lerp(a, b, f.x), dr.lerp(c, d, f.x), f.y)
 
     def divergence(self, sample: Sample) -> mi.Float:
-        """See `FilmFlow`."""
         (a, b, c, d), f = self._corners(sample.position)
         return CELLS * (dr.lerp(b.x - a.x, d.x - c.x, f.y) + dr.lerp(c.y - a.y, d.y - b.y, f.x))
 

@@ -159,13 +159,12 @@ class Executor(Protocol):
 
 
 class Local:
-    """Executor that evaluates shards sequentially in this process."""
+    """`Executor` that evaluates shards sequentially in this process."""
 
     def __init__(self, evaluate: Evaluate) -> None:
         self.evaluate = evaluate
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
-        """See `Executor`."""
         for shard in shards:
             yield self.evaluate(values, shard, learned)
 

@@ -201,7 +201,6 @@ class Staged:
         self._evaluate: Callable[[Arrays, Shard, Arrays], Evaluation] | None = None
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
-        """See `Evaluate`."""
         if self._number != shard.stage or self._evaluate is None:
             self._evaluate, self._number = None, shard.stage  # free the previous evaluator first
             self._evaluate = self._evaluator(shard.stage)

@@ -74,7 +74,7 @@ class Optimiser(Protocol):
 
 
 class DrJitOptimiser:
-    """An optimiser of ``drjit.opt``.
+    """An `Optimiser` of ``drjit.opt``.
 
     Large variables are stepped in pieces (see `PIECE`). Between steps, the optimiser keeps the state of each variable,
     but no copy of its values.
@@ -133,7 +133,6 @@ class DrJitOptimiser:
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
     ) -> dict[str, Array]:
-        """See `Optimiser`."""
         for key, value in values.items():
             reset = self._shapes.get(key) != value.shape
             if reset:
@@ -162,7 +161,6 @@ class DrJitOptimiser:
         return stepped
 
     def answer(self, values: Arrays) -> dict[str, Array]:
-        """See `Optimiser`."""
         return {}
 
     def _remembered(self, name: str, part: drjit.opt.Optimizer) -> dict[str, dr.ArrayBase]:
@@ -185,7 +183,6 @@ class DrJitOptimiser:
         return whole
 
     def restore(self, state: State, values: Arrays) -> None:
-        """See `Optimiser`."""
         for key, value in values.items():
             part = self._of(key)
             if self._shapes.get(key) != value.shape:

@@ -81,7 +81,7 @@ class _Means:
 
 
 class Averaged:
-    """An optimiser whose result is the combination of its last iterate with a mean of recent iterates.
+    """An `Optimiser` whose result is the combination of its last iterate with a mean of recent iterates.
 
     The steps are those of the given optimiser. Each variable has its own combination; variables of more than `MOST`
     entries have none.
@@ -109,7 +109,6 @@ class Averaged:
         return self._optimiser.step(values, gradients, rates, loss)
 
     def answer(self, values: Arrays) -> dict[str, Array]:
-        """See `Optimiser`."""
         return {
             key: means.combined(values[key])
             for key, means in self._means.items()

@@ -39,7 +39,7 @@ class _Asked(Exception):
 
 
 class LineSearch:
-    """Optimiser that runs a deterministic minimiser with bounds.
+    """`Optimiser` that runs a deterministic minimiser with bounds.
 
     The minimiser sees variables divided by their initial learning rates, and losses divided by the initial loss.
 
@@ -149,7 +149,6 @@ class LineSearch:
         return State(steps, arrays)
 
     def restore(self, state: State, values: Arrays) -> None:
-        """See `Optimiser`."""
         n = len(self._bounds)
         (count,) = {state.steps[key] for key in values} or {0}
         if {key: value.shape for key, value in values.items()} != self._shapes:

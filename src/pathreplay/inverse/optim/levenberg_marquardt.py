@@ -291,7 +291,6 @@ class LevenbergMarquardt:
         return State(steps, {_NAMES[name]: array for name, array in named.items()})
 
     def restore(self, state: State, values: Arrays) -> None:
-        """See `Optimiser`."""
         (count,) = {state.steps[key] for key in values} or {0}
         if {key: value.shape for key, value in values.items()} != self._shapes:
             raise ValueError("the shapes of its parameters differ")

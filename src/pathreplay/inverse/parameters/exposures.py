@@ -39,7 +39,6 @@ class Factors:
         self._log = Transform("log")
 
     def latent(self, values: Array) -> Array:
-        """See `Coordinates`."""
         return self._log.latent(values)
 
     def gradient(self, values: Array, by_values: Array) -> Array:
@@ -53,7 +52,6 @@ class Factors:
         return by_latent
 
     def values(self, latent: Array) -> Array:
-        """See `Coordinates`."""
         return self._log.values(latent - latent[self.fixed].mean(axis=0) if self.fixed else latent)
 
 

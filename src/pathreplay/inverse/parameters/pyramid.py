@@ -55,7 +55,6 @@ class Pyramid:
         return latent
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """See `Coordinates`."""
         level = by_values if self.inner is None else self.inner.gradient(values, by_values)
         parts = [level.ravel()]
         for coarse in reversed(_levels(values.shape)[:-1]):
@@ -64,7 +63,6 @@ class Pyramid:
         return np.concatenate(parts[::-1])
 
     def values(self, latent: Array) -> Array:
-        """See `Coordinates`."""
         first, *finer = self._levels[latent.size]
         end = prod(first)
         level = latent[:end].reshape(first)

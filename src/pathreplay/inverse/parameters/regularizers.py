@@ -58,7 +58,6 @@ class TotalVariation:
     weight: float
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
-        """See `Term`."""
         v = values.astype(np.float64)
         penalty, gradient = 0.0, np.zeros_like(v)
         for axis in range(v.ndim - 1):
@@ -79,7 +78,6 @@ class Prior:
     start: Array
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
-        """See `Term`."""
         start = self.start if self.start.shape == values.shape else resampled(self.start, values.shape)
         off = values.astype(np.float64) - start
         return self.weight * float(np.mean(off * off)), self.weight * 2 * off / off.size
@@ -108,7 +106,6 @@ class Laplacian:
         self.weight, self._away = weight, (away @ middle).tocsr()
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
-        """See `Term`."""
         δ = self._away @ values.reshape(-1, 3).astype(np.float64)
         gradient = self.weight * 2 / len(δ) * (self._away.T @ δ)
         return self.weight * float(np.sum(δ * δ)) / len(δ), gradient.reshape(values.shape)

@@ -69,7 +69,6 @@ class Transform:
         return low, high
 
     def latent(self, values: Array) -> Array:
-        """See `Coordinates`."""
         v = self._inside(values)
         if self.kind == "log":
             u = np.log(v)
@@ -81,7 +80,6 @@ class Transform:
         return np.asarray(u, np.float32)
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """See `Coordinates`."""
         v = self._inside(values)
         if self.kind == "log":
             slope = v
@@ -92,7 +90,6 @@ class Transform:
         return np.asarray(by_values * slope, np.float32)
 
     def values(self, latent: Array) -> Array:
-        """See `Coordinates`."""
         u = latent.astype(np.float64)
         if self.kind == "log":
             v = np.exp(np.minimum(u, LARGEST_LOG))

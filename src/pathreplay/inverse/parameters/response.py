@@ -42,11 +42,9 @@ class Increments:
         self._fixed = [float(values[k]) for k in held]
 
     def latent(self, values: Array) -> Array:
-        """See `Coordinates`."""
         return np.log(np.maximum(np.diff(values.astype(np.float64)), SMALLEST)).astype(np.float32)
 
     def values(self, latent: Array) -> Array:
-        """See `Coordinates`."""
         knots = np.zeros(len(latent) + 1)
         for (a, b), (low, high) in self._spans():
             rises = np.exp(latent[a:b].astype(np.float64) - float(latent[a:b].max()))
@@ -55,7 +53,6 @@ class Increments:
         return knots.astype(np.float32)
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """See `Coordinates`."""
         rises, found = np.diff(values.astype(np.float64)), np.zeros(len(values) - 1)
         for (a, b), (low, high) in self._spans():
             above = np.cumsum(by_values[a + 1 : b][::-1].astype(np.float64))[::-1]

@@ -22,16 +22,13 @@ class JointProblem(Problem):
     parts: tuple[Problem, ...] = ()
 
     def scenes(self) -> tuple[Problem, ...]:
-        """See `Problem`."""
         return self.parts
 
     def home(self, view: View) -> tuple[Problem, View]:
-        """See `Problem`."""
         part, place = self.place(view.sensor)
         return self.parts[part], self.parts[part].views[place]
 
     def with_targets(self, targets: Targets) -> JointProblem:
-        """See `Problem`."""
         joint = super().with_targets(targets)
         seen, parts = iter(joint.views), []
         for part in self.parts:
