@@ -8,7 +8,6 @@ parameter then identifies the object.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -20,7 +19,7 @@ from pathreplay.platform.threads import spare_thread
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
-from pathreplay.scenes.substitute import exchange
+from pathreplay.scenes.substitute import exchange, parsing
 
 Node: TypeAlias = "mi.parser.SceneNode"
 
@@ -54,25 +53,12 @@ class Described:
 
     def find_file(self, name: str) -> Path:
         """Resolve a file name of a property; relative names refer to the scene's folder."""
-        with _resolving(self.folder):
+        with parsing(self.folder):
             return Path(str(mi.file_resolver().resolve(name)))
 
 
 def _is_reference(node: Node, name: str) -> bool:
     return bool(node.props.type(name) == mi.Properties.Type.ResolvedReference)
-
-
-@contextmanager
-def _resolving(folder: Path | None) -> Iterator[None]:
-    outer = mi.file_resolver()
-    resolver = mi.FileResolver(outer)
-    if folder is not None:
-        resolver.prepend(mi.filesystem.path(str(folder)))
-    mi.set_file_resolver(resolver)
-    try:
-        yield
-    finally:
-        mi.set_file_resolver(outer)
 
 
 def describe(
@@ -97,10 +83,8 @@ def describe(
         RuntimeError: Mitsuba cannot read the scene.
         PathreplayError: see `load_file_with`, or the scene has no such medium.
     """
-    config = mi.parser.ParserConfig(mi.variant())
-    config.merge_equivalent = config.merge_meshes = False
     folder = None if isinstance(scene, Mapping) else Path(scene).parent.resolve()
-    with _resolving(folder):
+    with parsing(folder) as config:
         if isinstance(scene, Mapping):
             require_values(scene)
             state = mi.parser.parse_dict(config, dict(scene))

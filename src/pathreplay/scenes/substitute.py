@@ -44,8 +44,7 @@ def load_file_with(
     for name in {"config", "filename"}.intersection(parameters):
         raise PathreplayError(f"Scene parameter '{name}' has a name reserved by Mitsuba's parser; rename ${name}")
     require_shallow(path)
-    with _parsing() as config:
-        mi.file_resolver().prepend(mi.filesystem.path(str(path.parent)))
+    with parsing(path.parent) as config:
         state = mi.parser.parse_file(config, str(path), **parameters)
         return _instantiate(config, state, plugins, cameras, floats)
 
@@ -61,7 +60,7 @@ def load_dict_with(
     Objects in the dictionary that are already loaded are not changed. Raises PathreplayError for a value of None.
     """
     require_values(scene)
-    with _parsing() as config:
+    with parsing(None) as config:
         return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins, cameras, floats)
 
 
@@ -76,13 +75,16 @@ def exchange(props: mi.Properties, plugins: Mapping[str, str], floats: Collectio
 
 
 @contextmanager
-def _parsing() -> Iterator[mi.parser.ParserConfig]:
-    """Provide options for the parser, and use a separate file resolver within the block."""
+def parsing(folder: Path | None) -> Iterator[mi.parser.ParserConfig]:
+    """Provide options for the parser. Within the block, Mitsuba also finds files relative to ``folder``."""
     config = mi.parser.ParserConfig(mi.variant())
     # Merging equal objects would change parameter keys.
     config.merge_equivalent = config.merge_meshes = False
     outer = mi.file_resolver()
-    mi.set_file_resolver(mi.FileResolver(outer))
+    resolver = mi.FileResolver(outer)
+    if folder is not None:
+        resolver.prepend(mi.filesystem.path(str(folder)))
+    mi.set_file_resolver(resolver)
     try:
         yield config
     finally:
