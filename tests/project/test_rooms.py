@@ -354,4 +354,4 @@ def test_differentiation_is_called_in_one_place() -> None:
         for node in ast.walk(tree)
         if differentiates(node)
     }
-    assert places == {"adjoint/autodiff.py", "integrators/film/image.py", "integrators/film/domain.py"}
+    assert places == {"adjoint/autodiff.py", "integrators/film/image.py"}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film.image import transposed
 from pathreplay.platform.registration import mitsuba_integrator
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
@@ -82,14 +82,7 @@ class FilmPlaces:
 
     def undeveloped(self, grad_in: mi.TensorXf) -> mi.TensorXf:
         """Return g_j / ∫ h_j for each pixel j of a block; g_j is the adjoint of image pixel j, and h_j its filter."""
-        with dr.resume_grad():
-            pixels = mi.TensorXf(self._block().tensor())
-            dr.enable_grad(pixels)
-            image = self.developed(pixels)
-            dr.set_grad(image, grad_in)
-            dr.enqueue(dr.ADMode.Backward, image)
-            dr.traverse(dr.ADMode.Backward)
-            return dr.grad(pixels)
+        return transposed(self.developed, mi.TensorXf(self._block().tensor()), grad_in)
 
     def importance(self, block_grad: mi.TensorXf, s: mi.Point2f, wavelengths: mi.Spectrum) -> mi.Spectrum:
         """Return the adjoint W of the radiance at film positions ``s``.
@@ -98,7 +91,8 @@ class FilmPlaces:
         Outside the domain, W is zero. ``block_grad`` contains g_j / ∫ h_j: see `undeveloped`.
         """
         inside = dr.all((s >= 0) & (s < self.size))
-        return dr.select(inside, _splat_adjoint(lambda L: self._put(s, L, wavelengths), dr.width(s), block_grad), 0)
+        unit = dr.full(mi.Spectrum, 1.0, dr.width(s))
+        return dr.select(inside, transposed(lambda L: self._put(s, L, wavelengths), unit, block_grad), 0)
 
     def image(self, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
         """Splat radiance ``L`` at film positions ``s``, and return the image.
@@ -110,7 +104,8 @@ class FilmPlaces:
 
     def importance_of_pixels(self, block_grad: mi.TensorXf, pixel: mi.UInt32, wavelengths: mi.Spectrum) -> mi.Spectrum:
         """Return g_j / ∫ h_j (see `importance`) for each row-major index j in ``pixel``."""
-        return _splat_adjoint(lambda L: self.pixels(pixel, L, wavelengths), dr.width(pixel), block_grad)
+        unit = dr.full(mi.Spectrum, 1.0, dr.width(pixel))
+        return transposed(lambda L: self.pixels(pixel, L, wavelengths), unit, block_grad)
 
     def pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
         """Add radiance ``L`` to the pixels of a block by row-major index, without a filter, and return the pixels."""
@@ -157,18 +152,6 @@ class FilmPlaces:
             x = (k + 0.5) * step - rfilter.radius()
             total += dr.select((pixel + x >= begin) & (pixel + x < end), rfilter.eval(mi.Float(x)), 0)
         return total * step
-
-
-def _splat_adjoint(splat: Callable[[mi.Spectrum], mi.TensorXf], lanes: int, block_grad: mi.TensorXf) -> mi.Spectrum:
-    """Back-propagate ``block_grad``, the adjoint of pixels, through ``splat``, a linear function of radiance."""
-    with dr.resume_grad():
-        L = dr.full(mi.Spectrum, 1.0, lanes)
-        dr.enable_grad(L)
-        pixels = splat(L)
-        dr.set_grad(pixels, block_grad)
-        dr.enqueue(dr.ADMode.Backward, pixels)
-        dr.traverse(dr.ADMode.Backward)
-        return dr.grad(L)
 
 
 def _splat(block: mi.ImageBlock, film: mi.Film, position: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> None:

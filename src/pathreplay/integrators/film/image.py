@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,8 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass, Rays
 from pathreplay.platform import memory
 from pathreplay.platform.registration import mitsuba_integrator
+
+X = TypeVar("X", bound=dr.ArrayBase)
 
 # Dr.Jit counts the samples of one kernel in 32 bits.
 MOST_SAMPLES = 2**32 - 1
@@ -44,16 +47,21 @@ def splat(view: Pass, rays: Rays, L: mi.Spectrum, valid: mi.Bool) -> mi.TensorXf
 
 def adjoint(view: Pass, rays: Rays, grad_in: mi.TensorXf) -> mi.Spectrum:
     """Return δL of each ray: the adjoint ``grad_in`` of the image, propagated back through filter and normalisation."""
-    with dr.resume_grad():
-        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.position))  # one entry, and so one adjoint, per ray
-        dr.enable_grad(L)
-        image = splat(view, rays, L, mi.Bool(True))
-        dr.set_grad(image, grad_in)
-        dr.enqueue(dr.ADMode.Backward, image)
-        dr.traverse(dr.ADMode.Backward)
-        δL = dr.grad(L)
+    unit = dr.full(mi.Spectrum, 1.0, dr.width(rays.position))  # one entry, and so one adjoint, per ray
+    δL = transposed(lambda L: splat(view, rays, L, mi.Bool(True)), unit, grad_in)
     view.sensor.film().clear()  # remove the unit radiance that `splat` has added
     return δL
+
+
+def transposed(linear: Callable[[X], mi.TensorXf], x: X, adjoint: mi.TensorXf) -> X:
+    """Return the adjoint of the argument ``x`` of a linear function, given the ``adjoint`` of its value."""
+    with dr.resume_grad():
+        dr.enable_grad(x)
+        value = linear(x)
+        dr.set_grad(value, adjoint)
+        dr.enqueue(dr.ADMode.Backward, value)
+        dr.traverse(dr.ADMode.Backward)
+        return dr.grad(x)
 
 
 def film_size(sensor: mi.Sensor) -> tuple[int, int]:
