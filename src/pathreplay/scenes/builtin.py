@@ -270,11 +270,14 @@ def silhouette_in_mirror(resolution: int = 32) -> SceneDict:
     return {**scene, "integrator": {"type": "path", "max_depth": 3}, "view1": camera, "mirror": mirror}
 
 
-def _panel(place: mi.ScalarTransform4f, *colour: float) -> SceneDict:
-    """Describe a rectangle that emits light of one colour and reflects nothing."""
-    black = {"type": "diffuse", "reflectance": 0.0}
-    glow = {"type": "area", "radiance": {"type": "rgb", "value": list(colour)}}
-    return {"type": "rectangle", "to_world": place, "bsdf": black, "emitter": glow}
+def _panel(centre: list[float], half: list[float], colour: list[float], turn: float = 0) -> SceneDict:
+    """Describe a rectangle that faces +z, is turned by ``turn`` degrees, emits one colour and reflects nothing."""
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate(centre).rotate([0, 0, 1], turn).scale([*half, 1]),
+        "bsdf": {"type": "diffuse", "reflectance": 0.0},
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": colour}},
+    }
 
 
 def flat_colours(resolution: int = 32) -> SceneDict:
@@ -283,18 +286,14 @@ def flat_colours(resolution: int = 32) -> SceneDict:
     Each panel has uniform radiance, so small motions change an image only at edges. The camera looks at
     the panels from a distance of 3. The key of the camera's pose is ``camera.to_world``.
     """
-
-    def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> mi.ScalarTransform4f:
-        return mi.ScalarTransform4f().translate([x, y, z]).rotate([0, 0, 1], turn).scale([width, height, 1])
-
     return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 1},
         "camera": _camera([0.2, 0.1, 3], [0, 0, 0], 40, resolution),
-        "red": _panel(at(-0.5, 0.3, 0.4, 20, 0.3, 0.25), 0.9, 0.2, 0.1),
-        "green": _panel(at(0.5, 0.35, -0.4, -35, 0.4, 0.3), 0.2, 0.8, 0.3),
-        "blue": _panel(at(-0.35, -0.5, -0.8, 50, 0.4, 0.3), 0.2, 0.3, 1.0),
-        "white": _panel(at(0.35, -0.4, 0.6, 10, 0.2, 0.25), 0.9, 0.9, 0.9),
+        "red": _panel([-0.5, 0.3, 0.4], [0.3, 0.25], [0.9, 0.2, 0.1], 20),
+        "green": _panel([0.5, 0.35, -0.4], [0.4, 0.3], [0.2, 0.8, 0.3], -35),
+        "blue": _panel([-0.35, -0.5, -0.8], [0.4, 0.3], [0.2, 0.3, 1.0], 50),
+        "white": _panel([0.35, -0.4, 0.6], [0.2, 0.25], [0.9, 0.9, 0.9], 10),
     }
 
 
@@ -304,20 +303,16 @@ def glass_ball(resolution: int = 32) -> SceneDict:
     The sphere is visible only because it refracts and reflects light. The key of the sphere's index of refraction is
     ``glass.eta``, and the key of the sphere's pose is ``ball.to_world``.
     """
-
-    def at(x: float, y: float, z: float, width: float, height: float) -> mi.ScalarTransform4f:
-        return mi.ScalarTransform4f().translate([x, y, z]).scale([width, height, 1])
-
     return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 5},
         "camera": _camera([0, 0, 3], [0, 0, 0], 24, resolution),
         "glass": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
         "ball": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "ref", "id": "glass"}},
-        "back": _panel(at(0, 0, -3, 6, 6), 0.3, 0.4, 0.6),
-        "red": _panel(at(-0.35, 0.2, -1.6, 0.25, 0.35), 0.9, 0.2, 0.1),
-        "green": _panel(at(0.3, 0.3, -1.2, 0.25, 0.2), 0.2, 0.8, 0.3),
-        "white": _panel(at(0.15, -0.3, -1.4, 0.35, 0.2), 0.9, 0.9, 0.9),
+        "back": _panel([0, 0, -3], [6, 6], [0.3, 0.4, 0.6]),
+        "red": _panel([-0.35, 0.2, -1.6], [0.25, 0.35], [0.9, 0.2, 0.1]),
+        "green": _panel([0.3, 0.3, -1.2], [0.25, 0.2], [0.2, 0.8, 0.3]),
+        "white": _panel([0.15, -0.3, -1.4], [0.35, 0.2], [0.9, 0.9, 0.9]),
     }
 
 
