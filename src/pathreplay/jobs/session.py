@@ -10,7 +10,6 @@ from types import TracebackType
 
 from pathreplay.distributed.ray_executor import crew_of, require_executor
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.objective.reached import require_possible
 from pathreplay.inverse.problem.problem import build_problem
 from pathreplay.library.folder_run import FolderRun
@@ -87,7 +86,10 @@ def _iterations(
             stack.callback(resumed.lock.close)
         stack.enter_context(memory.within(config.budget))
         require_executor(config)
-        _set_variant(config)
+        with undisturbed():
+            variant = backend.set_variant(config.variant)
+        if config.deterministic:
+            require_order(variant)
         bar = progress_of(progress)
         stack.enter_context(bar)
         bar.say("preparing")
@@ -105,10 +107,3 @@ def _iterations(
         yield from iterations(problem, run, stop, (bar.observe, kept.observe), kept)
         bar.say("writing")
         return kept.finish()
-
-
-def _set_variant(config: Config) -> None:
-    with undisturbed():
-        variant = backend.set_variant(config.variant)
-    if config.deterministic:
-        require_order(variant)

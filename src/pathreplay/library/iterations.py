@@ -12,7 +12,6 @@ import mitsuba as mi
 from pathreplay.distributed.ray_executor import RayExecutor, WorkerPool
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.schema import Plugin
-from pathreplay.inverse.dataset import views
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.events import Event, Stepped
@@ -76,16 +75,10 @@ class Iteration:
 
 def rendered(problem: Problem, values: Arrays, view: int | str, spp: int | None) -> Image:
     """Render a view, given by index or name, with these values. Raises PathreplayError if there is no such view."""
-    about = view_of(problem, view)
-    with problem.computing():
-        return picture_of(problem, values, about, spp)
-
-
-def view_of(problem: Problem, view: int | str) -> views.View:
-    """Return a view by index or name. Raises PathreplayError if there is no such view."""
     for n, each in enumerate(problem.views):
         if view in (n, n - len(problem.views), each.name):
-            return each
+            with problem.computing():
+                return picture_of(problem, values, each, spp)
     raise PathreplayError(f"No view {shown(view)}; there are {', '.join(each.name for each in problem.views)}")
 
 

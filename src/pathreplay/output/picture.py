@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import re
 from collections.abc import Callable
@@ -11,12 +10,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import OpenEXR
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.integrators.film.image import MOST_SAMPLES, require_film
 from pathreplay.integrators.parts import rounded, split
-from pathreplay.inverse.images.io import Image, png_bytes
+from pathreplay.inverse.images.io import Image, exr_bytes, png_bytes
 from pathreplay.platform import memory
 from pathreplay.scenes.descriptions import errors_as
 
@@ -147,10 +145,4 @@ def file_bytes(rendering: Rendering, ending: str) -> bytes:
             other = next(name for name in rendering.channels if name not in colours)
             raise PathreplayError(f"A PNG file only holds colours, and the image has the channel '{other}'; use .exr")
         return png_bytes(rendering.image)
-    channels = {n: np.ascontiguousarray(rendering.image[:, :, i]) for i, n in enumerate(rendering.channels)}
-    buffer = io.BytesIO()
-    # Mitsuba's writer is not used, because it can deadlock; see `exr_bytes`.
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, channels, num_threads=0) as file:
-        file.write(buffer)
-    return buffer.getvalue()
+    return exr_bytes(rendering.image, rendering.channels)

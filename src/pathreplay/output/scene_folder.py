@@ -111,7 +111,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
     keys = list(params.keys())
     if len(keys) != len(owners):
         raise PathreplayError("The scene differs each time it is loaded, and cannot be exported")
-    placing = Placing(described, scene, _file_names(keys, scene))
+    placing = Placing(described, scene, file_names([*keys, *(shape.id() for shape in scene.shapes())]))
     for key, owner in zip(keys, owners, strict=True):
         if owner.node is described.nodes[0]:  # the parameter belongs to an existing mesh object: `meshes` writes it
             continue
@@ -179,10 +179,6 @@ def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
         params[key] = form.store(type(seen)(array) if dr.is_tensor_v(seen) else to_value(seen, array))
     params.update()
     return traversed(scene)
-
-
-def _file_names(keys: list[str], scene: mi.Scene) -> dict[str, str]:
-    return file_names([*keys, *(shape.id() for shape in scene.shapes())])
 
 
 def _plain_plugins(described: Described) -> list[str]:

@@ -53,20 +53,16 @@ class Device:
         """Whether the order of additions is reproducible if a single thread is used. On a GPU the order is random."""
         return not self.is_gpu
 
-    def local_bytes(self) -> int | None:
-        """Return the bytes of local memory that a lane may use; None on CPUs, which have no such limit."""
-        if not self.is_gpu:
-            return None
-        known = self.lanes > 0 and self.memory > 0
-        return min(LARGEST_LOCAL, int(SHARE * self.memory) // self.lanes) if known else LARGEST_LOCAL
-
     def most_records(self, size: int, otherwise: int) -> int:
         """Return the largest number of records of ``size`` bytes that a lane may have, which is at most ``otherwise``.
 
         On a GPU, the records must also fit into the local memory of the lane.
         """
-        room = self.local_bytes()
-        return otherwise if room is None else min(otherwise, room // size)
+        if not self.is_gpu:
+            return otherwise
+        known = self.lanes > 0 and self.memory > 0
+        room = min(LARGEST_LOCAL, int(SHARE * self.memory) // self.lanes) if known else LARGEST_LOCAL
+        return min(otherwise, room // size)
 
     def room(self, records: int) -> int:
         """Return the number of records to allocate if ``records`` are needed.

@@ -94,7 +94,8 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])
         table = next((tables[str(part)] for part in reversed(first["loc"][:-1]) if part in tables), job)
-        if (new := _renamed(key, table)) is not None:
+        new = next((name for name in RENAMED.get(key, "").split() if name in table.model_fields), None)
+        if new is not None:
             return f"unknown key '{where}'; it is called '{new}' now"
         return f"unknown key '{where}'; {_hint(key, table, job, tables)}"
     if first["type"] == "missing":
@@ -130,11 +131,6 @@ def _hint(key: str, table: type[BaseModel], job: type[BaseModel], tables: Mappin
 def _name_of(table: type[BaseModel], tables: Mapping[str, type[BaseModel]]) -> str:
     """Return the name of a table in messages."""
     return next((name for name, each in tables.items() if each is table), "this table")
-
-
-def _renamed(key: str, table: type[BaseModel]) -> str | None:
-    """Return the new name of an old key of the table, or None."""
-    return next((name for name in RENAMED.get(key, "").split() if name in table.model_fields), None)
 
 
 _ALTERNATIVES = ("int", "float", "bool", "str", "count", "ImageValue", "Value", "Displacement", "TransportStart")

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Hashable
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -112,11 +113,7 @@ def _of_yaml(error: yaml.YAMLError) -> str:
     return f"{getattr(error, 'problem', None) or error}{where}"
 
 
-def _yaml(text: str) -> object:
-    return yaml.load(text, _Plain)
-
-
 _FORMATS: dict[str, tuple[str, Callable[[str], object]]] = {
     ".json": ("JSON", json.loads),
-    **dict.fromkeys(YAML, ("YAML", _yaml)),
+    **dict.fromkeys(YAML, ("YAML", partial(yaml.load, Loader=_Plain))),
 }

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.dataset.photos import Photo
@@ -159,14 +160,7 @@ def _place(where: str, posed: _Posed) -> np.ndarray:
             f"{where} has the quaternion {posed.quaternion} and the translation {posed.translation}, which are not a "
             "valid camera pose; repair the model"
         )
-    w, x, y, z = q / length
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = Rotation.from_quat(np.roll(q, -1)).as_matrix()  # SciPy normalises, and expects w last
     place = np.eye(4)
     place[:3, :3], place[:3, 3] = rotation.T * [1, -1, -1], -rotation.T @ t
     return place

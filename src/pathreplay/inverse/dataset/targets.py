@@ -192,16 +192,13 @@ def read_targets(
                 "if the background of your scene is not black, use alpha = 'scene' to composite over it, or 'mask'"
             )
     if lenses:
-        notes.append(f"images undistorted to a pinhole camera: {len(lenses)}, taken with {_kinds(lenses)}")
+        kinds = ", ".join(sorted({lens.describe() for lens in lenses.values()}))
+        notes.append(f"images undistorted to a pinhole camera: {len(lenses)}, taken with {kinds}")
     notes += [
         f"target image '{files[0]}'{f' (and {len(files) - 1} others)' if len(files) > 1 else ''} {oddity}"
         for oddity, files in odd.items()
     ]
     return Targets(targets, weights), tuple(notes)
-
-
-def _kinds(lenses: Mapping[str, Lens]) -> str:
-    return ", ".join(sorted({lens.describe() for lens in lenses.values()}))
 
 
 def _require_alpha(what: str, image: Image, alpha: str, name: str, shape: tuple[int, int, int]) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -232,16 +232,14 @@ def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Ima
     return result.reshape(height, width, image.shape[2])
 
 
-def exr_bytes(image: Image) -> bytes:
+def exr_bytes(image: Image, names: Sequence[str] = ()) -> bytes:
     """Encode an image as a ZIP-compressed float32 OpenEXR file.
 
-    The channels are Y, YA, RGB or RGBA. More than four channels are named 0000, 0001, and so on. Mitsuba's writer is
-    not used, because it waits for its thread pool and deadlocks if the pool has a single thread.
+    By default, the channels are Y, YA, RGB or RGBA, or more than four channels with the names 0000, 0001, and so on.
+    Mitsuba's writer is not used, because it waits for its thread pool and deadlocks if the pool has a single thread.
     """
     count = image.shape[2]
-    names = {1: ["Y"], 2: ["Y", "A"], 3: ["R", "G", "B"], 4: ["R", "G", "B", "A"]}.get(
-        count, [f"{i:04d}" for i in range(count)]
-    )
+    names = names or {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}.get(count) or [f"{i:04d}" for i in range(count)]
     channels = {name: np.ascontiguousarray(image[:, :, i], np.float32) for i, name in enumerate(names)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     buffer = io.BytesIO()

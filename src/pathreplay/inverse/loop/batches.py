@@ -18,9 +18,5 @@ def batch(views: list[int], size: int | None, seed: int, iteration: int) -> list
         # The order affects the control variates of media, so it stays as in earlier versions.
         return views[::-1]
     number, k = divmod(iteration, -(-n // size))
-    return [views[i] for i in _shuffled(seed, number, n)[k * size : (k + 1) * size]]
-
-
-def _shuffled(seed: int, number: int, n: int) -> list[int]:
-    """Return the permutation of n views in epoch ``number``."""
-    return np.random.default_rng([seed, BATCH, number]).permutation(n).tolist()
+    shuffled = np.random.default_rng([seed, BATCH, number]).permutation(n).tolist()
+    return [views[i] for i in shuffled[k * size : (k + 1) * size]]

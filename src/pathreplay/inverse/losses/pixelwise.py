@@ -134,14 +134,10 @@ def find_loss(name: str, modules: Modules | None = None) -> Loss:
     if name in LOSSES:
         return LOSSES[name]
     if ":" in name:
-        return _imported(name, modules or Modules())
+        return Own((modules or Modules()).function("Loss", name, "image and target"))
     close = difflib.get_close_matches(name, LOSSES, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else ""
     raise PathreplayError(f"No loss '{name}'{hint} (losses: {', '.join(LOSSES)}, or module:function)")
-
-
-def _imported(name: str, modules: Modules) -> Loss:
-    return Own(modules.function("Loss", name, "image and target"))
 
 
 @dataclass(frozen=True)

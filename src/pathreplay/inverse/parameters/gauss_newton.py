@@ -71,15 +71,8 @@ class GaussNewton:
     def times(self, share: float) -> GaussNewton:
         """Return the model of ``share`` times the loss."""
         square = share * share
-        return GaussNewton(
-            self.sizes,
-            self.matrix * share,
-            self.robust * share,
-            self.bias * share,
-            self.noise * square,
-            self.spread * square,
-            self.excess * share,
-        )
+        once = {name: getattr(self, name) * share for name in ("matrix", "robust", "bias", "excess")}
+        return replace(self, **once, noise=self.noise * square, spread=self.spread * square)
 
     def within(self, sizes: Mapping[str, int]) -> GaussNewton:
         """Return the model with additional variables, on which the loss does not depend."""
@@ -118,12 +111,10 @@ class GaussNewton:
                 rows = [gradients[key](np.eye(size)[k]).ravel() for k in range(size)]
                 change[begin : begin + size, begin : begin + size] = np.transpose(rows)
             begin += size
+        names = "matrix", "robust", "bias", "noise"
         return replace(
             self,
-            matrix=change @ self.matrix @ change.T,
-            robust=change @ self.robust @ change.T,
-            bias=change @ self.bias @ change.T,
-            noise=change @ self.noise @ change.T,
+            **{name: change @ getattr(self, name) @ change.T for name in names},
             spread=change**4 @ self.spread,
         )
 

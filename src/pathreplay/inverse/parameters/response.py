@@ -91,27 +91,24 @@ def linearized(values: Mapping[str, Array], target: Image) -> Image:
 
     Returns the target itself if ``values`` contain no response.
     """
-    if RESPONSE not in values:
-        return target
-    curve, colours, rest = values[RESPONSE], *_split(target)
-    if len(curve) == 1:
-        changed = np.maximum(colours, 0) ** np.float64(curve[0])
-    else:
-        x = encoded(np.clip(colours, 0, 1))
-        changed = np.where(colours > 1, colours, decoded(np.interp(x, np.linspace(0, 1, len(curve)), curve)))
-    return np.concatenate([changed.astype(np.float32), rest], axis=2)
+    return _applied(values.get(RESPONSE), target)
 
 
 def stored(values: Mapping[str, Array], image: Image) -> Image:
     """Apply the inverse of `linearized`: the image that the camera would have stored."""
-    if RESPONSE not in values:
+    return _applied(values.get(RESPONSE), image, inverse=True)
+
+
+def _applied(curve: Array | None, image: Image, inverse: bool = False) -> Image:
+    if curve is None:
         return image
-    curve, colours, rest = values[RESPONSE], *_split(image)
+    colours, rest = _split(image)
     if len(curve) == 1:
-        changed = np.maximum(colours, 0) ** np.float64(1 / curve[0])
+        changed = np.maximum(colours, 0) ** np.float64(1 / curve[0] if inverse else curve[0])
     else:
-        y = encoded(np.clip(colours, 0, 1))
-        changed = np.where(colours > 1, colours, decoded(np.interp(y, curve, np.linspace(0, 1, len(curve)))))
+        knots = np.linspace(0, 1, len(curve)), curve
+        x = encoded(np.clip(colours, 0, 1))
+        changed = np.where(colours > 1, colours, decoded(np.interp(x, *(knots[::-1] if inverse else knots))))
     return np.concatenate([changed.astype(np.float32), rest], axis=2)
 
 

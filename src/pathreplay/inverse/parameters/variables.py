@@ -223,16 +223,18 @@ def _coordinates(
         )
         transform.require_inside(key, start)
     if entry.pyramid:
-        if start.ndim < 3:
-            raise PathreplayError(
-                f"Parameter '{key}' of shape {start.shape} is not a texture or volume; remove 'pyramid'"
-            )
+        _require_grid(key, start, "pyramid")
         shapes = [start.shape, *(levels.shapes if levels else ())]
         return Pyramid(shapes, wraps, transform)
     if entry.large_steps_lambda is None:
         return transform
     faces = _faces(params, key, "large_steps_lambda")
     return Surface(parameters.get_array(params[key]), faces, entry.large_steps_lambda)
+
+
+def _require_grid(key: str, start: Array, option: str) -> None:
+    if start.ndim < 3:
+        raise PathreplayError(f"Parameter '{key}' of shape {start.shape} is not a texture or volume; remove '{option}'")
 
 
 def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.integer]:
@@ -249,10 +251,7 @@ def _penalty(
     """Make the regularizers of a parameter. Raises PathreplayError if a regularizer fails in some resolution."""
     terms: list[Term] = []
     if entry.total_variation is not None:
-        if start.ndim < 3:
-            raise PathreplayError(
-                f"Parameter '{key}' of shape {start.shape} is not a texture or volume; remove 'total_variation'"
-            )
+        _require_grid(key, start, "total_variation")
         terms.append(TotalVariation(entry.total_variation))
     if entry.l2_to_initial is not None:
         terms.append(Prior(entry.l2_to_initial, start))
@@ -275,10 +274,7 @@ def _numbers(key: str, shape: list[int]) -> mi.TensorXf:
 def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> Levels | None:
     if entry.resolutions is None:
         return None
-    if start.ndim < 3:
-        raise PathreplayError(
-            f"Parameter '{key}' of shape {start.shape} is not a texture or volume; remove 'resolutions'"
-        )
+    _require_grid(key, start, "resolutions")
     parameter_limits.require_grid(key, start.shape, entry.resolutions)
     return make_levels(start.shape, entry.resolutions, refine_at)
 
