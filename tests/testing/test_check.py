@@ -19,6 +19,7 @@ from pathreplay import cli
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.path_limits import Limits
 from pathreplay.integrators.stateful import stateful
+from pathreplay.platform import progress_bar
 from pathreplay.scenes.parameters import get_array
 from pathreplay.testing import check_gradient, command
 from pathreplay.testing.direction import choose_line
@@ -586,7 +587,7 @@ def test_each_check_is_told_when_it_is_there(
         return plain(*arguments, **options)
 
     monkeypatch.setattr(command, "check_gradient", watched)
-    monkeypatch.setattr(command, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(progress_bar, "PAUSE_S", 0.0)
     keys = ["ball.bsdf.reflectance.value", "sky.radiance.value"]
     params = [option for key in keys for option in ("--param", key)]
     run(monkeypatch, str(tmp_path / "ball.xml"), *params, "--seeds", "2", "--spp", "1")

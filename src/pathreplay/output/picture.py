@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -16,6 +15,7 @@ from pathreplay.integrators.film.image import MOST_SAMPLES, require_film
 from pathreplay.integrators.parts import rounded, split
 from pathreplay.inverse.images.io import Image, exr_bytes, png_bytes
 from pathreplay.platform import memory
+from pathreplay.platform.progress_bar import Told
 from pathreplay.scenes.descriptions import errors_as
 
 # Samples per pass of the `independent` sampler. Passes take a few seconds, so that Ctrl-C takes effect soon.
@@ -24,9 +24,6 @@ _A_PASS = 2**24
 _A_SAMPLE = 64
 # Largest width and height in pixels. A larger size is probably a typo. Mitsuba would at best raise an error.
 _LARGEST_SIDE = 2**16
-
-Told = Callable[[int, int], None]
-"""Function that is called with the number of completed passes and the number of all passes."""
 
 
 @dataclass(frozen=True)

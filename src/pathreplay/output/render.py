@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.definitions import defined
-from pathreplay.output.picture import Told, file_bytes, find_sensor, render, set_size
+from pathreplay.output.picture import file_bytes, find_sensor, render, set_size
 from pathreplay.platform.atomic_files import require_writable, write_whole
+from pathreplay.platform.progress_bar import progress_bar
 from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.loading import load_scene
 from pathreplay.types import Json
 
 _OPTION = "-o"
-_SECONDS = 10.0
 # A larger number is probably a typing error: the noise of the image would be below single precision.
 _MOST_SPP = 10**6
 
@@ -73,7 +70,8 @@ def render_to_file(scene: str, output: Path, asked: RenderOptions, progress: boo
         set_size(camera, asked.size)
     samples = camera.sampler().sample_count() if spp is None else spp
     begin = time.perf_counter()
-    with _bar(progress) as tell:
+    bar = progress_bar("rendering, pass", lambda done, total: f"pass {done} of {total}") if progress else nullcontext()
+    with bar as tell:
         rendering = render(loaded, camera, renderer, samples, seed, tell)
     height, width, _ = rendering.image.shape
     write_whole(output, file_bytes(rendering, ending), _OPTION)
@@ -88,21 +86,3 @@ def _flat(option: str, table: Json, changes: Sequence[str]) -> Json:
         if isinstance(value, (dict, list)):
             raise PathreplayError(f"{option} {name} is {shown(value)}; give a number, a string, true or false")
     return result
-
-
-@contextmanager
-def _bar(shown: bool) -> Iterator[Told | None]:
-    """Show a transient bar on stderr, or periodic lines if stderr is not a terminal; yields the update function."""
-    console = Console(stderr=True, force_jupyter=False)
-    columns = (TextColumn("rendering, pass"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not (shown and console.is_terminal)) as bar:
-        task = bar.add_task("", total=None)
-        last = [time.monotonic()]
-
-        def tell(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-            if not console.is_terminal and time.monotonic() - last[0] >= _SECONDS:
-                last[0] = time.monotonic()
-                console.print(f"pathreplay: pass {done} of {total}", soft_wrap=True, highlight=False)
-
-        yield tell if shown else None

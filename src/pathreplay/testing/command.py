@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,20 +14,17 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.atomic_files import write_whole
+from pathreplay.platform.progress_bar import Told, progress_bar
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.parameters import resolve_differentiable
 from pathreplay.testing.gradient import GradientCheck, check_gradient
 from pathreplay.testing.picture import derivative_images
 from pathreplay.testing.reference import Spec, integrator_under_test
 
-# Seconds between two progress lines if standard error is not a terminal.
-_PAUSE_S = 10.0
 FORMATS = ("png", "pdf", "svg")
 _STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive": "yellow"}
 
@@ -55,30 +51,10 @@ def check_all(
         yield result
 
 
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a transient progress bar on standard error, or occasional lines if standard error is not a terminal."""
-    console = Console(stderr=True, force_jupyter=False)
-    if console.is_terminal:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console, transient=True) as bar:
-            task = bar.add_task(escape(what), total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
-        return
-
-    def say(line: str) -> None:
-        console.print(Text(f"pathreplay: {line}"), soft_wrap=True)
-
-    last = [time.monotonic()]
-
-    def tell(done: int, total: int) -> None:
-        if done == 0:
-            say(f"checking {what}")
-        elif time.monotonic() - last[0] >= _PAUSE_S:
-            last[0] = time.monotonic()
-            say(f"{what}: {done} of {total} renderings")
-
-    yield tell
+def _progress(what: str) -> AbstractContextManager[Told]:
+    return progress_bar(
+        what, lambda done, total: f"{what}: {done} of {total} renderings" if done else f"checking {what}"
+    )
 
 
 def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
