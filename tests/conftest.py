@@ -72,6 +72,16 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture
+def wall_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with the scene of `wall_job` in it."""
+    from wall_job import SCENE
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room.xml").write_text(SCENE)
+    return tmp_path
+
+
+@pytest.fixture
 def opened() -> Iterator[Callable[[Any], Any]]:
     """Opens cases of `truth`, and releases them at the end."""
     from truth import Bench

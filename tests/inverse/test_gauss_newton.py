@@ -20,18 +20,11 @@ from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.problem.problem import Problem, build_problem, put_values
 from pathreplay.jobs import iterate, make_config, optimize
 from small_job import checkpoint_bits
-from wall_job import JOB, SCENE
+from wall_job import JOB
 
 OPTIMIZER = {"type": "levenberg-marquardt"}
 KEY = JOB["parameters"][0]["key"]
 Values = dict[str, np.ndarray]
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
-    return tmp_path
 
 
 def start_of(problem: Problem) -> Values:
@@ -59,9 +52,9 @@ def unbiased(evaluation: Evaluation) -> float:
     return evaluation.loss - evaluation.model.excess
 
 
-def test_where_images_are_linear_the_loss_is_its_model(folder: Path) -> None:
+def test_where_images_are_linear_the_loss_is_its_model(wall_room: Path) -> None:
     """Reflectance and intensity one by one, with common random numbers: every second difference is an entry of H."""
-    problem = build_problem(make_config({**JOB, "integrator": {"type": "pathreplay", "max_depth": 2}}), folder)
+    problem = build_problem(make_config({**JOB, "integrator": {"type": "pathreplay", "max_depth": 2}}), wall_room)
     evaluate, values, shard = (
         Evaluator(problem, problem.integrator),
         start_of(problem),
@@ -87,11 +80,11 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("case", ["lamp", "relative", pytest.param("pose", marks=pytest.mark.slow)])
-def test_gradients_are_those_of_reverse_mode_and_of_finite_differences(case: str, folder: Path) -> None:
+def test_gradients_are_those_of_reverse_mode_and_of_finite_differences(case: str, wall_room: Path) -> None:
     """z over seeds; H against products of finite differences of nearly noiseless images."""
     job = {**JOB, "target": {"values": {KEY: [0.3, 0.5, 0.1]}, "spp": 16}}
     job["integrator"] = {"type": "pathreplay", "max_depth": 3}
-    problem = build_problem(make_config({**job, **CASES[case]}), folder)
+    problem = build_problem(make_config({**job, **CASES[case]}), wall_room)
     evaluate, values = Evaluator(problem, problem.integrator), start_of(problem)
     found = [evaluate(values, Shard((0,), 16, (s,), second_order=True), {}) for s in range(24)]
     back = np.array([flat(evaluate(values, Shard((0,), 16, (s,)), {}).gradients) for s in range(24)])
@@ -125,7 +118,7 @@ def run(**changes: Any) -> Any:
     return optimize(make_config({**JOB, "optimizer": OPTIMIZER, "iterations": 8, "spp": 16, **changes}), progress=False)
 
 
-def test_a_job_reaches_the_noise_limit_in_a_few_steps(folder: Path) -> None:
+def test_a_job_reaches_the_noise_limit_in_a_few_steps(wall_room: Path) -> None:
     """Errors that Adam does not reach in as many, from the same start."""
     found, adam = run(), run(optimizer={"type": "adam"}, learning_rate=0.1)
     start = np.sqrt(np.mean((np.array(JOB["parameters"][0]["initial"]) - JOB["target"]["values"][KEY]) ** 2))
@@ -135,7 +128,7 @@ def test_a_job_reaches_the_noise_limit_in_a_few_steps(folder: Path) -> None:
     assert found.report.exists() and found.iterations == 8
 
 
-def test_a_job_that_was_left_goes_on_bit_for_bit(folder: Path) -> None:
+def test_a_job_that_was_left_goes_on_bit_for_bit(wall_room: Path) -> None:
     run(output="whole")
     for stop in (0, 2, 5):
         for state in iterate(
@@ -147,7 +140,7 @@ def test_a_job_that_was_left_goes_on_bit_for_bit(folder: Path) -> None:
         assert checkpoint_bits(Path(f"cut{stop}")) == checkpoint_bits(Path("whole"))
 
 
-def test_a_job_ends_by_itself_with_a_tolerance(folder: Path) -> None:
+def test_a_job_ends_by_itself_with_a_tolerance(wall_room: Path) -> None:
     found = run(optimizer={**OPTIMIZER, "tolerance": 1e-4}, iterations=40, output="run")
     assert 2 < found.iterations < 40 and "less than the tolerance" in found.report.read_text()
     with pytest.raises(PathreplayError, match=r"has terminated .*; lower 'tolerance' in its config"):
@@ -156,10 +149,10 @@ def test_a_job_ends_by_itself_with_a_tolerance(folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["lamp", "pose"])
-def test_recorded_passes_and_shards_of_samples_are_the_same_model(case: str, folder: Path) -> None:
+def test_recorded_passes_and_shards_of_samples_are_the_same_model(case: str, wall_room: Path) -> None:
     """What the third evaluation replays is what the first has traced; and shards add up."""
     job = {**JOB, "target": {"values": {KEY: [0.3, 0.5, 0.1]}, "spp": 16}, "integrator": {"type": "pathreplay"}}
-    problem = build_problem(make_config({**job, **CASES[case]}), folder)
+    problem = build_problem(make_config({**job, **CASES[case]}), wall_room)
     values, shard = start_of(problem), Shard((0,), 16, (3,), second_order=True)
     evaluate, traced = Evaluator(problem, problem.integrator), Evaluator(problem, problem.integrator, record=False)
     for _ in range(3):
@@ -175,15 +168,15 @@ def test_recorded_passes_and_shards_of_samples_are_the_same_model(case: str, fol
     assert again.model.matrix.tobytes() == found.model.matrix.tobytes()
 
 
-def test_exposures_have_columns_of_their_own(folder: Path) -> None:
+def test_exposures_have_columns_of_their_own(wall_room: Path) -> None:
     """In a scene without noise, against finite differences of the gradient; white balance."""
     from pathreplay.inverse.images.io import exr_bytes
 
-    (folder / "room.xml").write_text(exposed_scene())
+    (wall_room / "room.xml").write_text(exposed_scene())
     for k in range(4):
-        (folder / f"{k}.exr").write_bytes(exr_bytes(np.full((4, 6, 3), 0.3, np.float32)))
+        (wall_room / f"{k}.exr").write_bytes(exr_bytes(np.full((4, 6, 3), 0.3, np.float32)))
     job = {**EXPOSED, "exposure": {"white_balance": True}, "spp": 4}
-    problem = build_problem(make_config(job), folder)
+    problem = build_problem(make_config(job), wall_room)
     evaluate, values = Evaluator(problem, problem.integrator), start_of(problem)
     values[EXPOSURE] = np.float32([[1.3, 1.1, 0.7], [0.6, 0.5, 0.9], [1.7, 1.4, 1.2], [1, 1, 1]])
     shard = Shard((2, 1, 0), 4, (1, 2, 3), second_order=True)
@@ -197,13 +190,13 @@ def test_exposures_have_columns_of_their_own(folder: Path) -> None:
     assert not found.model.matrix[12:].any()  # of the test view
 
 
-def test_a_job_with_exposures_recovers_them(folder: Path) -> None:
+def test_a_job_with_exposures_recovers_them(wall_room: Path) -> None:
     from exposed_job import LEVELS
     from pathreplay.inverse.images.io import exr_bytes
 
-    (folder / "room.xml").write_text(exposed_scene())
+    (wall_room / "room.xml").write_text(exposed_scene())
     for k, level in enumerate(LEVELS):
-        (folder / f"{k}.exr").write_bytes(exr_bytes(np.full((4, 6, 3), level, np.float32)))
+        (wall_room / f"{k}.exr").write_bytes(exr_bytes(np.full((4, 6, 3), level, np.float32)))
     job = {key: value for key, value in EXPOSED.items() if key != "final_learning_rate_ratio"}
     found = optimize(make_config({**job, "optimizer": OPTIMIZER, "iterations": 12, "spp": 2}), progress=False)
     products = found.parameters[EXPOSURE][:3, 0] * found.parameters["wall.bsdf.reflectance.value"].mean()

@@ -24,15 +24,11 @@ from pathreplay.inverse.problem.problem import build_problem
 from pathreplay.jobs import load_config, make_config, optimize
 from pathreplay.platform.interrupts import Stop
 from pathreplay.report.progress import Progress
-from wall_job import JOB, SCENE
+from wall_job import JOB
+
+pytestmark = pytest.mark.usefixtures("wall_room")
 
 KEY = JOB["parameters"][0]["key"]
-
-
-@pytest.fixture(autouse=True)
-def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
 
 
 class Spoilt(mi.ad.integrators.prb.PRBIntegrator):

@@ -16,7 +16,7 @@ from pathreplay.inverse.optim.adaptive import DrJitOptimiser, State
 from pathreplay.inverse.optim.averaging import LONG, SHORT, Averaged
 from pathreplay.jobs import make_config, optimize
 from small_job import bits
-from wall_job import JOB, SCENE
+from wall_job import JOB
 
 Arrays = dict[str, np.ndarray]
 
@@ -120,14 +120,7 @@ def test_a_large_variable_keeps_its_last_iterate(monkeypatch: pytest.MonkeyPatch
         assert bits(again.answer(x)) == bits(optimiser.answer(x))
 
 
-@pytest.fixture
-def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
-    return tmp_path
-
-
-def test_averaging_changes_the_result_of_a_job_but_not_its_iterates(room: Path) -> None:
+def test_averaging_changes_the_result_of_a_job_but_not_its_iterates(wall_room: Path) -> None:
     key = JOB["parameters"][0]["key"]
     target = {**JOB["target"], "spp": 4096}  # the minimum of a noisy target would be elsewhere
     fast = {**JOB, "target": target, "iterations": 80, "learning_rate": 0.1, "spp": 1}
@@ -143,8 +136,8 @@ def test_averaging_changes_the_result_of_a_job_but_not_its_iterates(room: Path) 
 
 
 @pytest.mark.parametrize("before", [True, False])
-def test_a_run_may_go_on_with_another_averaging(before: bool, room: Path) -> None:
-    (room / "job.json").write_text(json.dumps({**JOB, "spp": 2}))
+def test_a_run_may_go_on_with_another_averaging(before: bool, wall_room: Path) -> None:
+    (wall_room / "job.json").write_text(json.dumps({**JOB, "spp": 2}))
     problem = pathreplay.load_job("job.json")
     results = [
         pathreplay.minimize(problem, {"type": "adam", "iterate_averaging": averages}, steps=steps, output="run", **more)
@@ -154,8 +147,8 @@ def test_a_run_may_go_on_with_another_averaging(before: bool, room: Path) -> Non
     assert results[1].history[:3] == results[0].history
 
 
-def test_a_step_returns_the_average_and_goes_on_from_the_iterate(room: Path) -> None:
-    (room / "job.json").write_text(json.dumps({**JOB, "spp": 2, "learning_rate": 0.1}))
+def test_a_step_returns_the_average_and_goes_on_from_the_iterate(wall_room: Path) -> None:
+    (wall_room / "job.json").write_text(json.dumps({**JOB, "spp": 2, "learning_rate": 0.1}))
     problem = pathreplay.load_job("job.json")
     state = pathreplay.init(problem, {"type": "adam", "iterate_averaging": True})
     plain = pathreplay.init(problem, {"type": "adam", "iterate_averaging": False})

@@ -25,7 +25,7 @@ from pathreplay.inverse.parameters.reparameterization import Transform
 from pathreplay.inverse.parameters.variables import Variable, latent_bounds, latents
 from pathreplay.jobs import iterate, make_config, optimize
 from small_job import bits, checkpoint_bits
-from wall_job import JOB, SCENE
+from wall_job import JOB
 
 OPTIONS = Optimizer(type="l-bfgs-b", tolerance=1e-9)
 RATES = {"a": 0.5, "b": 0.1}
@@ -195,19 +195,12 @@ ENTRY = {**JOB["parameters"][0], "lower": 0.0, "upper": 1.0, "learning_rate": 0.
 SEARCHED = {**JOB, "optimizer": {"type": "l-bfgs-b"}, "parameters": [ENTRY], "spp": 16, "iterations": 40}
 
 
-@pytest.fixture
-def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
-    return tmp_path
-
-
 def saved(folder: str) -> dict[str, bytes]:
     return checkpoint_bits(Path(folder))
 
 
 @pytest.mark.parametrize("transform", [None, pytest.param("logit", marks=pytest.mark.slow)])
-def test_a_job_ends_by_itself_and_at_its_best(transform: str | None, room: Path) -> None:
+def test_a_job_ends_by_itself_and_at_its_best(transform: str | None, wall_room: Path) -> None:
     entry = ENTRY if transform is None else {**ENTRY, "parameterization": transform}
     result = optimize(make_config({**SEARCHED, "parameters": [entry], "output": "run"}), progress=False)
     assert result.iterations < 40 and not result.stopped and "Terminated" in result.report.read_text()
@@ -222,7 +215,7 @@ def test_a_job_ends_by_itself_and_at_its_best(transform: str | None, room: Path)
 
 
 @pytest.mark.slow
-def test_all_evaluations_see_the_same_random_numbers(room: Path) -> None:
+def test_all_evaluations_see_the_same_random_numbers(wall_room: Path) -> None:
     """So that the loss is a function: at the start values once more, it is the same."""
     states = list(iterate(make_config({**SEARCHED, "output": "run"})))
     from pathreplay.inverse.loop.loop import new_run
@@ -231,7 +224,7 @@ def test_all_evaluations_see_the_same_random_numbers(room: Path) -> None:
     from pathreplay.platform.threads import one_thread
 
     config = make_config(SEARCHED)
-    problem = build_problem(config, room)
+    problem = build_problem(config, wall_room)
     with one_thread(True):
         evaluate = new_run(problem, problem.integrator, record=False).executor.evaluate  # type: ignore[attr-defined]
         best = min(states, key=lambda state: state.loss)
@@ -240,7 +233,7 @@ def test_all_evaluations_see_the_same_random_numbers(room: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_job_that_was_left_goes_on_bit_for_bit(room: Path) -> None:
+def test_a_job_that_was_left_goes_on_bit_for_bit(wall_room: Path) -> None:
     whole = optimize(make_config({**SEARCHED, "output": "whole"}), progress=False)
     for stop in range(whole.iterations - 1):
         for state in iterate(make_config({**SEARCHED, "output": f"cut{stop}"})):
@@ -274,7 +267,7 @@ def test_what_makes_no_sense_is_refused_in_one_line(case: str) -> None:
     assert words in str(told.value) and "\n" not in str(told.value)
 
 
-def test_the_rate_of_sgd_is_held_to_no_step(room: Path) -> None:
+def test_the_rate_of_sgd_is_held_to_no_step(wall_room: Path) -> None:
     """Its step is the rate times the gradient, which may be as small as the rate is large."""
     job = {**JOB, "iterations": 1, "parameters": [{**JOB["parameters"][0], "learning_rate": 1e7}]}
     with pytest.raises(PathreplayError, match="lower 'learning_rate'"):

@@ -18,7 +18,9 @@ from pathreplay.inverse.config.schedules import rate
 from pathreplay.inverse.config.schema import ITERATION
 from pathreplay.inverse.parameters.reparameterization import Transform
 from pathreplay.jobs import make_config, optimize
-from wall_job import JOB, SCENE
+from wall_job import JOB
+
+pytestmark = pytest.mark.usefixtures("wall_room")
 
 # Configs, and the optimiser of a script by hand.
 OPTIMISERS = {
@@ -34,12 +36,6 @@ OPTIMISERS = {
 
 QUICK = ("adam, told", "adamw")
 LAST = {"iterate_averaging": False}
-
-
-@pytest.fixture(autouse=True)
-def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
 
 
 def by_hand(opt: drjit.opt.Optimizer, rates: Any = None) -> np.ndarray:

@@ -17,16 +17,12 @@ from pathreplay.platform import memory
 from pathreplay.platform.interrupts import ENDING
 from room_job import CLOUD
 from small_job import checkpoint_bits
-from wall_job import JOB, SCENE
+from wall_job import JOB
+
+pytestmark = pytest.mark.usefixtures("wall_room")
 
 KEY = JOB["parameters"][0]["key"]
 MEDIUM = {**CLOUD, "spp": 4, "eval_spp": 4, "deterministic": True, "iterations": 3}
-
-
-@pytest.fixture(autouse=True)
-def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
 
 
 def job(**changes: Any) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +13,7 @@ from pathreplay.report import notebook
 from pathreplay.report.pages.page import Picture, View, thinned
 from pathreplay.report.pages.panel import MOST_POINTS, Panel
 from small_job import points
-from wall_job import JOB, SCENE
+from wall_job import JOB
 
 HOSTILE = "<script>alert('\"')</script>"
 
@@ -28,11 +27,8 @@ def test_only_a_kernel_is_a_notebook(outputs: list[str], monkeypatch: pytest.Mon
     assert not notebook.in_notebook()
 
 
-def test_a_run_draws_one_output_anew_and_prints_nothing(
-    outputs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
+@pytest.mark.usefixtures("wall_room")
+def test_a_run_draws_one_output_anew_and_prints_nothing(outputs: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     job = {**JOB, "iterations": 4, "output": "run", "preview": {"share": 0.5}}
     result = optimize(make_config(job))
     assert capfd.readouterr().err == ""
@@ -48,11 +44,8 @@ def test_a_run_draws_one_output_anew_and_prints_nothing(
     assert old[0] == new[0] and old[1] != new[1]
 
 
-def test_what_is_gone_on_with_shows_all_of_its_curve(
-    outputs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
+@pytest.mark.usefixtures("wall_room")
+def test_what_is_gone_on_with_shows_all_of_its_curve(outputs: list[str]) -> None:
     with iterate(make_config({**JOB, "iterations": 4, "output": "run"}), progress=True) as session:
         next(session), next(session)
     assert "2 of 4" in outputs[-1] and len(points(outputs[-1])) == 2
@@ -61,9 +54,8 @@ def test_what_is_gone_on_with_shows_all_of_its_curve(
     assert not points(outputs[0]) and len(points(outputs[-1])) == 4 and "4 of 4" in outputs[-1]
 
 
-def test_silence_where_it_is_asked_for(outputs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
+@pytest.mark.usefixtures("wall_room")
+def test_silence_where_it_is_asked_for(outputs: list[str]) -> None:
     optimize(make_config({**JOB, "iterations": 1, "output": "run"}), progress=False)
     assert outputs == []
 

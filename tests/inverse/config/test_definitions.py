@@ -16,7 +16,7 @@ from pathreplay.inverse.config.definitions import defined
 from pathreplay.inverse.config.schema import Config
 from pathreplay.jobs import load_config, make_config, optimize
 from places import ROOT
-from wall_job import JOB, SCENE
+from wall_job import JOB
 
 TABLE: dict[str, Any] = {"scene": "a.xml", "spp": 16, "parameters": [{"key": "a"}, {"key": "b", "lower": 0.0}]}
 GIVEN = {
@@ -68,10 +68,8 @@ def test_what_leads_nowhere_is_refused_in_one_line(change: str) -> None:
 
 
 @pytest.fixture
-def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
-    path = tmp_path / "job.json"
+def job(wall_room: Path) -> Path:
+    path = wall_room / "job.json"
     path.write_text(json.dumps(JOB))
     return path
 

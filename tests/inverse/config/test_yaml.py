@@ -9,7 +9,9 @@ import yaml
 
 from pathreplay.errors import PathreplayError
 from pathreplay.jobs import load_config, make_config, optimize
-from wall_job import JOB, SCENE
+from wall_job import JOB
+
+pytestmark = pytest.mark.usefixtures("wall_room")
 
 TEXT = """
 scene: room.xml
@@ -27,12 +29,6 @@ target:
   values:
     wall.bsdf.reflectance.value: [0.6, 0.5, 0.1]
 """
-
-
-@pytest.fixture(autouse=True)
-def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
 
 
 @pytest.mark.parametrize("name", ["job.yaml", "job.YML"])

@@ -21,7 +21,7 @@ from pathreplay.inverse.images.metrics import C1, C2, CUT, SIGMA, _similarity
 from pathreplay.inverse.losses import image_losses as losses
 from pathreplay.inverse.losses.pixelwise import LOSSES, find_loss, mean_loss
 from pathreplay.jobs import make_config, optimize
-from wall_job import JOB, SCENE
+from wall_job import JOB
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -152,17 +152,10 @@ def test_a_factor_does_not_count() -> None:
     assert value_and_gradient("scale-invariant", 3 * target, target, None)[0] == pytest.approx(0, abs=1e-10)
 
 
-@pytest.fixture
-def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.xml").write_text(SCENE)
-    return tmp_path
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ssim", "scale-invariant", "smape", "relative-l1"])
 @pytest.mark.parametrize("integrator", ["pathreplay", "prb"])
-def test_a_job_learns_by_it(name: str, integrator: str, room: Path) -> None:
+def test_a_job_learns_by_it(name: str, integrator: str, wall_room: Path) -> None:
     """Recorded passes, too: more iterations than the two that are traced."""
     entry = {**JOB["parameters"][0], "initial": [0.2, 0.5, 0.3], "lower": 0.0, "upper": 1.0}
     plugin = {"type": integrator, "max_depth": 2}
@@ -216,20 +209,20 @@ def test_a_networks_gradient_follows_its_value(stub: types.ModuleType, masked: b
 
 
 @pytest.mark.slow
-def test_a_job_learns_by_a_network(stub: types.ModuleType, room: Path) -> None:
+def test_a_job_learns_by_a_network(stub: types.ModuleType, wall_room: Path) -> None:
     result = optimize(make_config({**JOB, "loss": "lpips", "spp": 64, "iterations": 20}), progress=False)
     assert result.history[-1].loss < 0.7 * result.history[0].loss
 
 
-def test_without_the_module_one_line_says_so(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_module_one_line_says_so(wall_room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lpips", None)
     losses._network.cache_clear()
     with pytest.raises(PathreplayError, match=r"Loss 'lpips' needs a package .*pip install 'pathreplay\[lpips\]'"):
         optimize(make_config({**JOB, "loss": "lpips"}), progress=False)
-    assert [path.name for path in room.iterdir()] == ["room.xml"]
+    assert [path.name for path in wall_room.iterdir()] == ["room.xml"]
 
 
-def test_weights_that_cannot_be_loaded_are_told_in_one_line(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_that_cannot_be_loaded_are_told_in_one_line(wall_room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def offline(**options: Any) -> None:
         raise OSError("<urlopen error [Errno -2] Name or service not known>")
 
