@@ -9,7 +9,6 @@ from operator import add
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from pathreplay.adjoint.autodiff import Unreached
 from pathreplay.adjoint.baseline import Baseline
@@ -23,7 +22,7 @@ from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.properties import HIDE_EMITTERS, MAX_DEPTH, PATHS, RR_DEPTH, flag, whole_number
 from pathreplay.integrators.reach import unreached_note
 from pathreplay.integrators.scene_facts import facts_of
-from pathreplay.integrators.stateful import Learned, no_pixel_sweep, require_nothing_learned
+from pathreplay.integrators.stateful import Unlearned
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.registration import mitsuba_integrator
 from pathreplay.transport.facts.traits import Tables
@@ -31,7 +30,6 @@ from pathreplay.transport.motion import path_moves, weights_vary
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
-from pathreplay.types import Json
 
 UNBOUNDED = 0xFFFFFFFF
 
@@ -60,7 +58,7 @@ def reached(scene: mi.Scene, sensor: Which, zero_is_error: bool = False) -> Iter
             raise Unreached(note or str(error)) from error
 
 
-class PathIntegrator:
+class PathIntegrator(Unlearned):
     """Base of all integrators of this package: a template that `on_base` combines with Mitsuba's base class.
 
     Properties: see `PATHS`.
@@ -75,7 +73,6 @@ class PathIntegrator:
     attach = "none"
     uses_sobol = False  # whether Owen-scrambled Sobol samples replace independent samples
     boundary = "none"  # boundary terms that are estimated
-    baseline: object = None  # learned state
     interior: Term
     max_depth: int  # this member and the next two belong to Mitsuba's integrator
     rr_depth: int
@@ -298,28 +295,6 @@ class PathIntegrator:
     def is_recordable(self, has_media: bool) -> bool:
         """Return False: see `StatefulIntegrator`."""
         return False
-
-    def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
-        """Return why `pixel_pass` cannot be used, with the remedy; "" if it can."""
-        return no_pixel_sweep(type(self).__name__)
-
-    def pixel_pass(
-        self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
-    ) -> tuple[mi.TensorXf, PassState]:
-        """Raise PathreplayError, because this integrator has no pixel sweep."""
-        raise PathreplayError(self.why_no_pixel_sweep(view.scene))
-
-    def state_dict(self) -> dict[str, np.ndarray]:
-        """Return an empty dictionary, because nothing is learned."""
-        return {}
-
-    def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None:
-        """Restore the result of `state_dict`. Raises PathreplayError unless it is empty."""
-        require_nothing_learned(learned)
-
-    def options(self) -> Json:
-        """Return an empty dictionary: see `StatefulIntegrator`."""
-        return {}
 
     def silence(self, notes: Iterable[str]) -> None:
         """Suppress the given notes."""

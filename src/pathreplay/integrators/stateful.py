@@ -72,20 +72,54 @@ class StatefulIntegrator(Protocol):
         """Return properties with which `pathreplay` matches this integrator, without properties of `PathIntegrator`."""
 
 
+class Unlearned:
+    """Methods of integrators that learn nothing, and have no pixel sweep."""
+
+    baseline: object = None
+
+    @property
+    def _kind(self) -> str:
+        """Name of the integrator's class."""
+        return type(self).__name__
+
+    def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
+        """Return why `pixel_pass` cannot be used, with the remedy; "" if it can."""
+        return f"{self._kind} renders whole images only; take the integrator 'pathreplay'"
+
+    def pixel_pass(
+        self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
+    ) -> tuple[mi.TensorXf, PassState]:
+        """Raise PathreplayError."""
+        raise PathreplayError(self.why_no_pixel_sweep(view.scene))
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        return {}
+
+    def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None:
+        """Raise PathreplayError unless ``learned`` is empty."""
+        if learned:
+            raise PathreplayError(
+                "The checkpoint contains state that another integrator learned from media; set the config's "
+                "'integrator' back, or start a new run"
+            )
+
+    def options(self) -> Json:
+        return {}
+
+
 @dataclass(frozen=True)
-class Stateless:
+class Stateless(Unlearned):
     """Adapter for an integrator of Mitsuba: its passes return the state unchanged and learn nothing."""
 
     integrator: mi.Integrator
 
     @property
-    def name(self) -> str:
-        """Class name of the integrator."""
+    def _kind(self) -> str:
         return type(self.integrator).__name__
 
     @property
     def boundary(self) -> str:
-        return "all" if _PROJECTIVE in self.name else "none"
+        return "all" if _PROJECTIVE in self._kind else "none"
 
     @property
     def warned(self) -> frozenset[str]:
@@ -95,14 +129,11 @@ class Stateless:
         """Do nothing, since no notes are logged."""
 
     def is_recordable(self, has_media: bool) -> bool:
-        return self.name in _RECORDABLE and not has_media
+        return self._kind in _RECORDABLE and not has_media
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
         """Return True, because Mitsuba's integrators do not tell whether a parameter reaches the paths."""
         return True
-
-    def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
-        return no_pixel_sweep(self.name)
 
     def pass_of(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:
         return Pass.of(scene, sensor, seed, spp)
@@ -127,40 +158,7 @@ class Stateless:
             self.integrator.render_backward(view.scene, params, grad_in, view.sensor, view.seed, view.spp)
         return state
 
-    def pixel_pass(
-        self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
-    ) -> tuple[mi.TensorXf, PassState]:
-        """Raise PathreplayError, because Mitsuba's integrators have no pixel sweep."""
-        raise PathreplayError(no_pixel_sweep(self.name))
-
-    @property
-    def baseline(self) -> None:
-        return None
-
-    def state_dict(self) -> dict[str, np.ndarray]:
-        return {}
-
-    def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None:
-        require_nothing_learned(learned)
-
-    def options(self) -> Json:
-        return {}
-
 
 def stateful(integrator: mi.Integrator) -> StatefulIntegrator:
     """Return the integrator itself if it implements the interface. Otherwise return an adapter for it."""
     return integrator if isinstance(integrator, StatefulIntegrator) else Stateless(integrator)
-
-
-def no_pixel_sweep(name: str) -> str:
-    """Return why the integrator class ``name`` does not implement `adjoint.pixel_sweep`, with the remedy."""
-    return f"{name} renders whole images only; take the integrator 'pathreplay'"
-
-
-def require_nothing_learned(learned: Learned) -> None:
-    """Raise PathreplayError if ``learned`` is not empty, for integrators that cannot learn."""
-    if learned:
-        raise PathreplayError(
-            "The checkpoint contains state that another integrator learned from media; set the config's 'integrator' "
-            "back, or start a new run"
-        )

@@ -54,7 +54,7 @@ class ParticleTerm(Term):
             return TermResult(dr.zeros(mi.TensorXf, picture_shape(view.sensor)))
         image, moves = particle_tangent(*work, lost)
         dr.eval(image)
-        return self._result(work[1], lost, moves, image)
+        return TermResult(image, lost=lost.count, paths=work[1].number, moves=True) if moves else TermResult(image)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         """Back-propagate the adjoint of the image: see `Term`."""
@@ -63,7 +63,7 @@ class ParticleTerm(Term):
             raise Unreached("no light path starts at an emitter of the scene")
         moves = particle_sweep(*work, grad_in, lost)
         dr.eval()
-        return self._result(work[1], lost, moves)
+        return TermResult(lost=lost.count, paths=work[1].number, moves=True) if moves else TermResult()
 
     def _work(self, view: Pass, trace: TraceConfig) -> tuple[TraceConfig, Particles, ParticleFilm] | None:
         emission = Emission.of(view.scene, view.sensor, self.caustics)
@@ -73,10 +73,3 @@ class ParticleTerm(Term):
         key = key_of(view.opaque_seed, mi.UInt32(int(Stream.PARTICLES)))
         trace = link_of(replace(trace, max_depth=self.max_depth), view.sensor, self.caustics)
         return trace, Particles(emission, key, film.pixels * view.spp), film
-
-    def _result(
-        self, particles: Particles, lost: NonFiniteCounter, moves: bool, image: mi.TensorXf | None = None
-    ) -> TermResult:
-        if not moves:
-            return TermResult(image)
-        return TermResult(image, lost=lost.count, paths=particles.number, moves=True)
