@@ -203,15 +203,6 @@ class RecoveredPose:
         values = {"error": self.value, "error_at_start": self.value_at_start}
         return {kind: error for kind, value in values.items() if (error := self.pose.error(value)) is not None}
 
-    def rows(self) -> dict[str, str]:
-        """Return table rows by name: the parts of the pose, and its errors."""
-        table: dict[str, str] = {}
-        for kind, parts in (("start", self.start), ("recovered", self.result)):
-            for part, array in parts.items():
-                unit = "°" if part == "rotation" else ""
-                table[f"{kind}, {part}"] = ", ".join(f"{v:.4g}{unit}" for v in array)
-        return table | {kind.replace("_at_", " at the "): str(e) for kind, e in reversed(self.errors().items())}
-
     def as_dict(self) -> Json:
         """Return the entry of this pose in parameters.json."""
         table: Json = {"pose": self.pose.kind, "pivot": list(self.pose.pivot)}

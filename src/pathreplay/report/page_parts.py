@@ -141,7 +141,13 @@ def about(item: Recovered, baseline: str = "") -> str:
 
 def pose_rows(item: RecoveredPose) -> tuple[Row, ...]:
     """Return the table rows of a pose: its parts and errors."""
-    return tuple(Row(name, (text,)) for name, text in item.rows().items())
+    table: dict[str, str] = {}
+    for kind, parts in (("start", item.start), ("recovered", item.result)):
+        for part, array in parts.items():
+            unit = "°" if part == "rotation" else ""
+            table[f"{kind}, {part}"] = ", ".join(f"{v:.4g}{unit}" for v in array)
+    table |= {kind.replace("_at_", " at the "): str(error) for kind, error in reversed(item.errors().items())}
+    return tuple(Row(name, (text,)) for name, text in table.items())
 
 
 def pose_note(item: RecoveredPose) -> str:

@@ -7,7 +7,7 @@ towards small values. The estimator f'(e A, T) B therefore uses two independent 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -145,14 +145,3 @@ def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Imag
     for view, (picture, target, weight) in pictures.items():
         rows[view] = fitted(picture, linearized(values, target), weight, rows.shape[1] > 1)
     return {**values, EXPOSURE: rows}
-
-
-def fixed_rows(names: Iterable[str], trained: Iterable[int], reference: str | None, free: bool) -> list[int]:
-    """Return the indices of the views whose mean factor is fixed, for the argument ``fixed`` of `Factors`.
-
-    If there is a reference view, the list contains only this view. Otherwise it contains all training views. If
-    ``free`` is set, the list is empty.
-    """
-    if free:
-        return []
-    return list(trained) if reference is None else [list(names).index(reference)]

@@ -44,7 +44,7 @@ from pathreplay.inverse.images.io import picture_size
 from pathreplay.inverse.losses.pixelwise import Loss, find_loss
 from pathreplay.inverse.parameters import limits as parameter_limits
 from pathreplay.inverse.parameters.derived import Derived, make_derived
-from pathreplay.inverse.parameters.exposures import EXPOSURE, Factors, fixed_rows
+from pathreplay.inverse.parameters.exposures import EXPOSURE, Factors
 from pathreplay.inverse.parameters.exposures import start as start_of_exposures
 from pathreplay.inverse.parameters.grids import rmse
 from pathreplay.inverse.parameters.pose import Pose
@@ -399,18 +399,15 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
     if (options := config.exposure) is None:
         return []
     value = start_of_exposures(len(views), min(view.target.shape[2] for view in views), options.white_balance)
-    trained = [n for n, view in enumerate(views) if not view.is_test]
-    reference = None
+    fixed = [n for n, view in enumerate(views) if not view.is_test] if options.fix_scale else []
     if options.reference is not None:
-        names = named_views(
-            scene, {view.name: view.sensor for view in views}, [options.reference], "exposure.reference"
-        )
-        reference = names[0]
-        if views[[view.name for view in views].index(reference)].is_test:
+        sensors = {view.name: view.sensor for view in views}
+        (reference,) = named_views(scene, sensors, [options.reference], "exposure.reference")
+        fixed = [list(sensors).index(reference)]
+        if views[fixed[0]].is_test:
             raise PathreplayError(
                 f"exposure: the reference '{reference}' is a test view; name a training view as the reference"
             )
-    fixed = fixed_rows([view.name for view in views], trained, reference, not options.fix_scale)
     rate = options.learning_rate or config.learning_rate
     return [Variable(EXPOSURE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=Factors(fixed))]
 
