@@ -204,7 +204,6 @@ class EmitterSegment(PlaneSegment):
         return dr.select(in_cone, d + (to_y - dr.detach(to_y)), light.d)
 
     def probe(self, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        """Probe position ``t``: see `Probe`."""
         return self._probe(self.probe_emitter(t, active))
 
     def _probe(self, sample: EmitterProbe) -> VisibilityProbe:

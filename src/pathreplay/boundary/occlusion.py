@@ -39,7 +39,6 @@ class ArcSegment(Arc):
         return self.observer.trace.traits.hard_lights and self.observer.trace.media is None
 
     def probe(self, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        """Probe position ``t``: see `Probe`."""
         return self._probe(t, active, self.hard)
 
     def _probe(self, t: mi.Float, active: mi.Bool, hard: bool) -> VisibilityProbe:

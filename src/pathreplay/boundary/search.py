@@ -189,7 +189,6 @@ class SegmentDensity:
         return SegmentDensity(self.width, self.height, self.margin, cdf / dr.gather(mi.Float64, cdf, n - 1))
 
     def _probability(self, i: mi.UInt32) -> mi.Float:
-        """Return the probability of a pixel."""
         if self.cdf is None:
             return mi.Float(1 / (self.width * self.height))
         begin = dr.select(i > 0, dr.gather(mi.Float64, self.cdf, i - 1, i > 0), 0)

@@ -52,7 +52,6 @@ class Boundary(Term):
     spp: int = 0  # segments per pixel of each search; 0 means the samples per pixel of the pass
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Compute the tangent of the image: see `Term`."""
         places = FilmPlaces.of(view)
         if not _move(trace, places):
             return TermResult()
@@ -64,7 +63,6 @@ class Boundary(Term):
         return TermResult(image)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        """Back-propagate the adjoint of the image: see `Term`."""
         places = FilmPlaces.of(view)
         if not _move(trace, places):
             return TermResult()

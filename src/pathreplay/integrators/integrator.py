@@ -152,7 +152,6 @@ class PathReplayIntegrator(PathIntegrator):
         return replace(trace, without_caustics=True)
 
     def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Compute the tangent of the image as the sum of all terms."""
         if self.particles is None:
             return PathIntegrator._forward(self, terms, part, trace, learned)
         camera = [term.forward(self._camera_view(part), trace, learned) for term in terms]
@@ -368,7 +367,6 @@ class PathReplayIntegrator(PathIntegrator):
         self.baseline = ref(facts_of(scene)), baseline
 
     def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
-        """Log a note if edges move and their boundary term is left out: see `PathIntegrator`."""
         if self.particles is not None and result.moves:
             for note in particle_notes(trace, view.sensor):
                 self._warn_once(note)

@@ -22,7 +22,7 @@ from pathreplay.adjoint.sweep import sweep
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.image import adjoint, splat
 from pathreplay.integrators.film.pixel_passes import pixel_camera
-from pathreplay.integrators.term import TermResult
+from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.device import device_of
 from pathreplay.transport.vertex import TraceConfig
 
@@ -63,7 +63,7 @@ def back_propagate(view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, driver:
 
 
 @dataclass(frozen=True)
-class PathReplay:
+class PathReplay(Term):
     """The interior term: `forward` in forward mode, and `sweep`, `replay` or `emission_only` in reverse mode.
 
     The docstrings of these functions state what is not differentiated. Unlike `sweep`, `replay` does not differentiate
@@ -76,11 +76,9 @@ class PathReplay:
     recovery: Recovery  # regularisation of `replay`
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Compute the tangent of the image: see `Term`."""
         return tangent(view, self._with_baseline(trace, learned), forward)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        """Back-propagate the adjoint of the image: see `Term`."""
         trace = self._with_baseline(trace, learned)
         if not self._sweeps(trace):
             driver = partial(replay, recovery=self.recovery)

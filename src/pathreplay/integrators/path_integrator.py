@@ -222,7 +222,6 @@ class PathIntegrator(Unlearned):
         """Log warnings about the passes since `begin`, and update the learned state from their results."""
 
     def _image(self, part: Pass, trace: TraceConfig) -> mi.TensorXf:
-        """Render the image of a part of a pass."""
         return image(part, trace)
 
     def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
@@ -293,7 +292,6 @@ class PathIntegrator(Unlearned):
             return path_moves(trace, start, at) or weights_vary(trace, at)
 
     def is_recordable(self, has_media: bool) -> bool:
-        """Return False: see `StatefulIntegrator`."""
         return False
 
     def silence(self, notes: Iterable[str]) -> None:

@@ -161,5 +161,4 @@ def step(problem: Problem, state: State) -> State:
 
 
 def _copied(state: adaptive.State) -> adaptive.State:
-    """Copy the state of an optimiser."""
     return adaptive.State(dict(state.steps), {name: np.array(state.arrays[name]) for name in state.arrays})

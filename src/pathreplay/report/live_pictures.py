@@ -115,7 +115,6 @@ class LivePictures:
         return tuple(found)
 
     def losses(self) -> tuple[float, ...]:
-        """Return the losses of all iterations."""
         return tuple(entry.loss for entry in self._run.history)
 
     def stored(self, view: View) -> float:

@@ -83,7 +83,6 @@ class ViewPictures:
         return (*_KINDS, *(() if self.baseline is None else ("baseline", "baseline-difference")))
 
     def picture(self, kind: str) -> Image:
-        """Return the image of a kind; see `kinds`."""
         if kind in ("difference", "baseline-difference"):
             image = self.result if kind == "difference" else self.baseline
             assert image is not None

@@ -42,11 +42,9 @@ class OtherInterior(Term):
     forward_driver: ForwardDriver
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Compute the tangent of the image: see `Term`."""
         return tangent(view, trace, self.forward_driver)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        """Back-propagate the adjoint of the image: see `Term`."""
         return back_propagate(view, trace, grad_in, self.reverse_driver)
 
 

@@ -41,7 +41,6 @@ class FilmPlaces:
         return FilmPlaces(view, corner, mi.ScalarVector2f(film.crop_size()) + 2 * border)
 
     def ray(self, s: mi.Point2f, key: mi.UInt32) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """Return the camera ray through a film position and its weight: see `FilmDomain`."""
         sensor, sampler, position = self.view.sensor, CounterSampler.stream(key, Stream.CAMERA), self.in_sensor(s)
         time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = sampler.next_1d(), sampler.next_2d()
@@ -61,12 +60,10 @@ class FilmPlaces:
         return 1 / PIXELS if self.is_coarse else 1.0
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
-        """Return whether the camera ray through a film position may move under the film flow: see `FilmDomain`."""
         flow = self.view.flow
         return mi.Bool(False) if flow is None else flow.leaves_rest_at(self.in_sensor(s))
 
     def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
-        """Project a point onto the film: see `FilmDomain`."""
         sensor = self.view.sensor
         if sensor.class_name() not in PROJECTING:
             return mi.Point2f(0), mi.Bool(False)

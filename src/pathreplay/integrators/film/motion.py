@@ -77,7 +77,6 @@ class FilmMotion(Term):
     flow: FilmFlow
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Compute the tangent of the image: see `Term`."""
         places, f = FilmPlaces.of(view), self._trace(view, trace)
         with dr.resume_grad():
             (δ,) = tangents(self._flow_factor(view, f))
@@ -87,7 +86,6 @@ class FilmMotion(Term):
         return TermResult(places.developed(pixels))
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        """Back-propagate the adjoint of the image: see `Term`."""
         places, f = FilmPlaces.of(view), self._trace(view, trace)
         block_grad = places.undeveloped(grad_in)
         smooth = blurred(block_grad)
@@ -151,7 +149,6 @@ class FilmMotion(Term):
         return dr.sum(dr.mean(L)) / dr.maximum(mi.Float(dr.count(moving)), 1)
 
     def _trace(self, view: Pass, trace: TraceConfig) -> FlowPaths:
-        """Trace the paths of a pass."""
         width, height = view.size
         groups = -(-view.spp // self.flow.samples)
         i = dr.arange(mi.UInt32, width * height * groups * GROUP)

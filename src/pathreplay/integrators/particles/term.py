@@ -48,7 +48,6 @@ class ParticleTerm(Term):
         return None if work is None else particle_image(*work)
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Compute the tangent of the image: see `Term`."""
         work, lost = self._work(view, trace), NonFiniteCounter()
         if work is None:
             return TermResult(dr.zeros(mi.TensorXf, picture_shape(view.sensor)))
@@ -57,7 +56,6 @@ class ParticleTerm(Term):
         return TermResult(image, lost=lost.count, paths=work[1].number, moves=True) if moves else TermResult(image)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        """Back-propagate the adjoint of the image: see `Term`."""
         work, lost = self._work(view, trace), NonFiniteCounter()
         if work is None:
             raise Unreached("no light path starts at an emitter of the scene")

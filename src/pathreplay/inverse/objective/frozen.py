@@ -261,7 +261,6 @@ def linear_derivative(
 
 
 def _derivative(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weight: mi.TensorXf | None) -> mi.TensorXf:
-    """Return the derivative of a loss with respect to the image."""
     dr.enable_grad(image)
     dr.backward(mean_loss(loss, image, target, weight))
     return dr.grad(image)

@@ -180,7 +180,6 @@ def _of_scipy(
     tolerance: float,
     **more: object,
 ) -> object:
-    """Run SciPy's L-BFGS-B."""
     options = {"maxcor": history_size, "ftol": tolerance, "gtol": 0.0, "maxfun": ENDLESS, "maxiter": ENDLESS}
     return scipy.optimize.minimize(function, start, method="L-BFGS-B", options=options, **more)
 

@@ -143,7 +143,6 @@ class _Summary:
         self._sum, self._count, self.peak, self.transparent = np.zeros(3), 0.0, 0.0, False
 
     def add(self, picture: Prepared) -> None:
-        """Add an image."""
         weight = np.ones((*picture.image.shape[:2], 1)) if picture.weight is None else picture.weight
         self._sum += (picture.image * weight).sum(axis=(0, 1))
         self._count += float(weight.sum())

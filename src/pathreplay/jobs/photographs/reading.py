@@ -74,12 +74,10 @@ def find_photos(folder: Path) -> Found:
 
 
 def _model(folder: Path) -> Path | None:
-    """Return the folder of the COLMAP model."""
     named = (folder / name for name in MODELS)
     return next((path for path in named for e in (".bin", ".txt") if not file_problem(path / f"cameras{e}")), None)
 
 
 def _images(folder: Path, model: Path) -> Path:
-    """Return the folder of the images of a COLMAP model."""
     places = [folder / "images", model / "images", model.parent / "images", model / ".." / ".." / "images"]
     return next((path for path in places if path.is_dir()), folder)
