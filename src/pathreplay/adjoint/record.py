@@ -7,7 +7,7 @@ table.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, make_dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from functools import cache, reduce
 from typing import Any
 
@@ -15,7 +15,6 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.platform.device import Device, device_of
-from pathreplay.transport import vertex
 from pathreplay.transport.vertex import (
     Arrival,
     Flight,
@@ -161,24 +160,6 @@ BITS = (
     ("kept.media.null", "media"),
 )
 LOBE_SHIFT = 16
-
-
-def _require_known(place: str, remembered: str) -> None:
-    """Raise TypeError unless ``place`` is a field of `VertexRecord` and ``remembered`` a property of `Layout`."""
-    kind: Any = VertexRecord
-    for name in place.split("."):
-        types = {each.name: str(each.type).split(" ")[0] for each in fields(kind)}
-        if name not in types:
-            raise TypeError(f"{kind.__name__} has no '{name}': '{place}' cannot be recorded")
-        kind = getattr(vertex, types[name], None)
-        if kind is None:  # a class of Mitsuba or Dr.Jit, whose fields are not checked
-            break
-    if remembered not in {each.name for each in fields(Layout)} | {"varies"}:
-        raise TypeError(f"Layout has no '{remembered}', on which '{place}' depends")
-
-
-for _place, *_, _remembered in (*FIELDS, *BITS):  # an entry that names no existing field raises an error on import
-    _require_known(_place, _remembered)
 
 
 @cache

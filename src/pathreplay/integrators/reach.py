@@ -27,19 +27,14 @@ def reached_sensors(
     return [not owners.isdisjoint(below[sensor]) for sensor in sensors]
 
 
-def attached_keys(params: mi.SceneParameters) -> list[str]:
-    """Return the keys whose values have gradients."""
-    with dr.resume_grad():
-        return [key for key, value in known_values(params) if dr.grad_enabled(value)]
-
-
 def unreached_note(scene: mi.Scene, sensor: mi.Sensor) -> str:
     """Format the message that no parameter with gradients reaches the paths of a sensor.
 
     Returns "" if all parameters with gradients belong to other cameras. The gradient of this image is then zero.
     """
     params = mi.traverse(scene)
-    keys = attached_keys(params)
+    with dr.resume_grad():
+        keys = [key for key, value in known_values(params) if dr.grad_enabled(value)]
     if keys and not reached_sensors(scene, [sensor], params, keys)[0]:
         return ""
     named = ", ".join(f"'{key}'" for key in keys[:3]) + (" ..." if len(keys) > 3 else "")

@@ -177,11 +177,12 @@ class Objects:
         """Convert derived parameters to tables."""
         tables: list[Json] = []
         for key, each in derived.items():
+            options = each.displace
             table = {
                 "key": key,
                 "of": list(each.of),
                 "function": None if each.function is None else self.named(each.function),
-                "displace": None if each.displace is None else _plain_table(each.displace),
+                "displace": None if options is None else {name: _plain(value) for name, value in options.items()},
             }
             tables.append({name: value for name, value in table.items() if value is not None})
         return tables
@@ -209,10 +210,6 @@ def _array(key: str, value: object) -> Array | None:
     except (TypeError, ValueError, RuntimeError) as error:
         why = " ".join(str(error).split())
         raise PathreplayError(f"Parameter '{key}': 'initial' is not an array ({why}); give a NumPy array") from None
-
-
-def _plain_table(table: Mapping[str, object]) -> Json:
-    return {name: _plain(value) for name, value in table.items()}
 
 
 def _plain(value: object) -> object:

@@ -76,7 +76,8 @@ def caustic_heights(
             # Convert the flux through the plane z = const to the flux on the tilted surface above the same area.
             flux = flux * (1 - (incoming[..., 0] * slope_x + incoming[..., 1] * slope_y) / incoming[..., 2])
             _require_lit(flux)
-            φ = potential(density / _at(flux, *_sources(φ, aspect)), φ, aspect)
+            there = scipy.ndimage.map_coordinates(flux, _sources(φ, aspect), order=1, mode="nearest")
+            φ = potential(density / there, φ, aspect)
             to_y, to_x = _receivers(φ, aspect)
         end_x, end_y = optics.centre + (to_x - (columns - 1) / 2) * scale, (to_y - (rows - 1) / 2) * scale
         ends = np.stack([end_x, end_y, np.full_like(h, optics.distance)], -1)
@@ -178,10 +179,6 @@ def _receivers(φ: Field, aspect: float) -> tuple[Field, Field]:
 
 def _cross(a: Field, b: Field) -> Field:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _at(field: Field, rows: Field, columns: Field) -> Field:
-    return scipy.ndimage.map_coordinates(field, [rows, columns], order=1, mode="nearest")
 
 
 def _divergence(slope_x: Field, slope_y: Field) -> Field:

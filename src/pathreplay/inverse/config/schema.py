@@ -241,17 +241,13 @@ class Config(Table):
         return self
 
     @model_validator(mode="after")
-    def _refined_in_time(self) -> Config:
+    def _entries(self) -> Config:
         for entry in self.parameters:
             if entry.refine_at and entry.refine_at[-1] >= self.iterations:
                 entry._refuse(
                     f"refine_at {entry.refine_at[-1]} is not less than iterations = {self.iterations}; "
                     "refine earlier, or raise 'iterations'"
                 )
-        return self
-
-    @model_validator(mode="after")
-    def _derived(self) -> Config:
         used = {name for entry in self.derived for name in entry.of}
         for entry in self.parameters:
             if entry.shape is None:
@@ -267,16 +263,12 @@ class Config(Table):
         return self
 
     @model_validator(mode="after")
-    def _one_factor(self) -> Config:
+    def _of_photos(self) -> Config:
         if self.exposure is not None and self.loss == "scale-invariant":
             raise ValueError(
                 "exposure: loss = 'scale-invariant' already fits a factor to each view; remove 'exposure', or use "
                 "another loss"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _of_photos(self) -> Config:
         if self.response is None:
             return self
         if self.loss not in PIXELWISE:

@@ -124,7 +124,8 @@ class Own:
         """See `Term`. Raises PathreplayError if the function fails, or its value or gradient is not finite."""
         v = mi.TensorXf(np.ascontiguousarray(values))
         dr.enable_grad(v)
-        value = self.function(_flat, mi.TensorXf(v))  # a copy, which the function may modify
+        copy = mi.TensorXf(v)  # which the function may modify
+        value = self.function(lambda value: mi.TensorXf(value).array, copy)
         if dr.width(value) != 1:
             raise PathreplayError(f"{self.function} returns {dr.width(value)} numbers; return one, such as a mean")
         if dr.grad_enabled(value):
@@ -183,10 +184,6 @@ def _differentiable(term: Term, values: mi.TensorXf) -> mi.TensorXf:
     value, slope = term(np.array(dr.detach(values)))
     linear = dr.sum((values - dr.detach(values)) * mi.TensorXf(slope.astype(np.float32)), axis=None)
     return linear + value
-
-
-def _flat(value: object) -> mi.Float:
-    return mi.TensorXf(value).array
 
 
 def _ends(axes: int, axis: int, before: int, after: int) -> list[tuple[int, int]]:
