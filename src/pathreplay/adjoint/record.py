@@ -95,7 +95,6 @@ class Layout:
 
     @staticmethod
     def of(trace: TraceConfig, moves: bool) -> Layout:
-        """Return the layout of the records of a trace."""
         media = trace.media is not None
         fixed = not media and not moves and not trace.traits.lights_vary and trace.to_sensor is None
         kinds = {name: media and getattr(trace.media, name) for name in ("chromatic", "emissive", "passes")}

@@ -74,7 +74,6 @@ class SampledEmitter:
         return SampledEmitter(ptr, mi.Point3f(sphere.x, sphere.y, sphere.z), sphere.w, polar)
 
     def may_move(self, trace: TraceConfig) -> mi.Bool:
-        """Return whether the emitter may move."""
         moving = trace.traits.moving
         moves = mi.Bool(moving is None)
         for shape in moving or ():
@@ -150,7 +149,6 @@ class EmitterSegment(PlaneSegment):
         return self._reflected(t)[0]
 
     def direction(self, t: mi.Float) -> mi.Vector2f:
-        """Return the direction of the reflected segment at position ``t``."""
         return self._reflected(t)[1]
 
     def _reflected(self, t: mi.Float) -> tuple[mi.Point2f, mi.Vector2f]:

@@ -208,7 +208,6 @@ class ObserverVertex:
         return active & (~self.event | seen)
 
     def hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-        """Intersect a ray from the observer with the scene."""
         return meet(self.trace, ray, active)
 
     def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:

@@ -69,7 +69,6 @@ class SceneMemory(Generic[T]):
             self._entries.pop(key, None)
 
     def clear(self) -> None:
-        """Remove all scenes."""
         self._entries.clear()
 
 

@@ -225,13 +225,11 @@ class PathIntegrator(Unlearned):
         return image(part, trace)
 
     def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Compute the tangent of the image as the sum of all terms."""
         return reduce(add, [term.forward(part, trace, learned) for term in terms])
 
     def _backward(
         self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None
     ) -> TermResult:
-        """Back-propagate the adjoint of the image through all terms."""
         return reduce(add, [term.backward(part, trace, grad_in, learned) for term in terms])
 
     def _planned(self, view: Pass, state: PassState) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
@@ -251,7 +249,6 @@ class PathIntegrator(Unlearned):
         return Pass.of(scene, sensor, seed, spp, self.uses_sobol)
 
     def _require_active(self, scene: mi.Scene) -> None:
-        """Raise PathreplayError if the scene or this integrator belongs to a variant that is not active."""
         if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
             raise PathreplayError(
                 f"{self.name}: scene or integrator belongs to another variant than the active one, "
@@ -295,7 +292,6 @@ class PathIntegrator(Unlearned):
         return False
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Suppress the given notes."""
         self.warned.update(notes)
 
     def _described(self, **more: object) -> str:

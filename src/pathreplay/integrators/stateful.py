@@ -79,24 +79,20 @@ class Unlearned:
 
     @property
     def _kind(self) -> str:
-        """Name of the integrator's class."""
         return type(self).__name__
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
-        """Return why `pixel_pass` cannot be used, with the remedy; "" if it can."""
         return f"{self._kind} renders whole images only; take the integrator 'pathreplay'"
 
     def pixel_pass(
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]:
-        """Raise PathreplayError."""
         raise PathreplayError(self.why_no_pixel_sweep(view.scene))
 
     def state_dict(self) -> dict[str, np.ndarray]:
         return {}
 
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None:
-        """Raise PathreplayError unless ``learned`` is empty."""
         if learned:
             raise PathreplayError(
                 "The checkpoint contains state that another integrator learned from media; set the config's "

@@ -174,7 +174,6 @@ class Objects:
         return {name: _plain(value) for name, value in table.items() if value is not None}
 
     def made(self, derived: Mapping[str, Derived]) -> list[Json]:
-        """Convert derived parameters to tables."""
         tables: list[Json] = []
         for key, each in derived.items():
             options = each.displace

@@ -48,7 +48,6 @@ class Result:
     """Run folder, which contains ``report.html``; None if no files were written."""
 
     def __repr__(self) -> str:
-        """Return a short description for notebooks."""
         stopped = "" if self.stopped is None else f", ended by {self.stopped}"
         return f"<Result: {len(self.history)} iterations, loss {self.loss:.4g}{stopped}; {', '.join(self.values)}>"
 

@@ -180,7 +180,6 @@ class Problem:
         return joint
 
     def __repr__(self) -> str:
-        """Return a short description for notebooks."""
         return f"<Problem: {', '.join(self.initial)}; {len(self.built.views)} views, loss {self.built.config.loss}>"
 
     @property

@@ -78,7 +78,6 @@ class State:
     _task: _Task = field(repr=False)
 
     def __repr__(self) -> str:
-        """Return a short description for notebooks."""
         loss = f", loss {self.loss:.4g}" if self.history else ""
         return f"<State: after {len(self.history)} steps{loss}; {', '.join(self.values)}>"
 

@@ -68,7 +68,6 @@ class ParticleFilm:
 
     @property
     def pixels(self) -> int:
-        """Number of pixels."""
         return self.width * self.height
 
     def footprint(self, s: mi.Point2f) -> Footprint:

@@ -49,7 +49,6 @@ class EmitterSamples:
 
     @staticmethod
     def draw(sampler: Sampler) -> EmitterSamples:
-        """Draw the random numbers of one ray."""
         return EmitterSamples(sampler.next_1d(), sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
 
 
@@ -254,12 +253,10 @@ class EmitterStart:
         return self.emission.emit(self.trace, self.u, self.active)
 
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
-        """Intersect the rays with the scene. Nothing is differentiated."""
         ray, _ = dr.detach(self.emit())
         hit = meet(trace, ray, active)
         return Arrival(ray=mi.Ray3f(ray), hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
 
     def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:
-        """Return origin and direction of the rays, differentiably."""
         ray, _ = self.emit()
         return ray.o, ray.d

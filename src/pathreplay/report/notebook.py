@@ -55,12 +55,10 @@ class NotebookPanel:
         self._pictures, self._title = pictures, title
 
     def say(self, text: str) -> None:
-        """Show the current phase of the job."""
         self._status = text
         self._draw()
 
     def status(self, text: str) -> None:
-        """Show a transient status at the next update."""
         self._status = f"optimizing: {text}"
 
     def remark(self, text: str) -> None:
@@ -73,7 +71,6 @@ class NotebookPanel:
         self._draw()
 
     def observe(self, event: Event) -> None:
-        """Show an event of the run."""
         if isinstance(event, Started):
             self._begin, self._before, self._wanted = time.monotonic(), event.done, event.wanted
             self.say("optimizing")

@@ -260,7 +260,6 @@ class Outcome:
         return [view for view in self.views if view.is_test]
 
     def has_flip(self) -> bool:
-        """Return whether the image metric FLIP was computed for any view."""
         return any(view.likenesses["result"].flip is not None for view in self.views)
 
     def command(self) -> str:

@@ -104,14 +104,12 @@ class Progress:
             self.note(note)
 
     def start(self, done: int, total: int) -> None:
-        """Start counting iterations."""
         self._bar.reset(self._task, total=total, completed=done, description="optimizing", loss="")
         self._begin, self._before = time.monotonic(), done
         if self._lines:
             self._print(f"optimizing, iterations {done} to {total}")
 
     def advance(self, loss: float) -> None:
-        """Count one completed iteration."""
         self._bar.update(self._task, advance=1, loss=f"loss {loss:.4g}")
         if not self._lines:
             return

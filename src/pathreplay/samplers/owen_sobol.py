@@ -32,16 +32,13 @@ class OwenSobolSampler:
         return OwenSobolSampler(dr.brev(path), mi.UInt32(key), mi.UInt32(0))
 
     def clone(self) -> OwenSobolSampler:
-        """Return a copy that continues with the same samples."""
         return OwenSobolSampler(mi.UInt32(self.reversed), mi.UInt32(self.key), mi.UInt32(self.drawn))
 
     def next_1d(self, active: bool | mi.Bool = True) -> mi.Float:
-        """Draw a uniform sample in [0, 1)."""
         key, x = self._next()
         return _unit(_scrambled(x, key * 0x85EBCA6B))
 
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
-        """Draw a uniform sample in the unit square."""
         key, x = self._next()
         return mi.Point2f(_unit(_scrambled(x, key * 0x85EBCA6B)), _unit(_scrambled(_second(x), key * 0xC2B2AE35)))
 

@@ -53,7 +53,6 @@ class CameraStart:
         return at
 
     def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:
-        """Return origin and direction of the rays, differentiably."""
         return self.ray.o, self.ray.d
 
 

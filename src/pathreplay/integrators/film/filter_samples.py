@@ -40,7 +40,6 @@ class FilterSamples:
 
     @staticmethod
     def of(film: mi.Film) -> FilterSamples:
-        """Create the sampler of the film's filter."""
         radius = film.rfilter().radius()
         return FilterSamples._of(radius, film.rfilter().eval(_step_centres(radius)) * (2 * radius / STEPS))
 
@@ -62,7 +61,6 @@ class FilterSamples:
         return FilterSamples(radius, cdf, masses, total)
 
     def cdf_at(self, x: mi.Float) -> mi.Float:
-        """Return the cumulative distribution at an offset."""
         position, i = self._locate(x)
         begin, end = self._step(i)
         return dr.lerp(begin, end, position - mi.Float(i))
@@ -86,7 +84,6 @@ class FilterSamples:
         return dr.select(dr.abs(x) <= self.radius, dr.gather(mi.Float, self.masses, self._locate(x)[1]), 0)
 
     def sign(self, x: mi.Float) -> mi.Float:
-        """Return the sign of the tabulated function at an offset."""
         return dr.sign(dr.gather(mi.Float, self.masses, self._locate(x)[1]))
 
     def _locate(self, x: mi.Float) -> tuple[mi.Float, mi.UInt32]:

@@ -127,7 +127,6 @@ class SurfaceFlow:
         return self.moves_at(position)
 
     def carry_tangents(self) -> None:
-        """Propagate tangents from the parameters to the velocities at the nodes."""
         with dr.resume_grad():
             tangents(self.nodes)
 

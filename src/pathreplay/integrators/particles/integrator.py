@@ -74,7 +74,6 @@ class ParticleIntegrator(PathReplayIntegrator):
         return PathReplayIntegrator._planned(self, view, state, follow)
 
     def _camera_view(self, view: Pass) -> Pass:
-        """Return the pass that generates the camera rays, with a limited number of rays."""
         return _few_rays(view)
 
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:

@@ -196,7 +196,6 @@ def _divergence(slope_x: Field, slope_y: Field) -> Field:
 
 
 def _require_lit(flux: Field) -> None:
-    """Raise PathreplayError if a part of the surface turns away from the light."""
     if flux.min() <= 0:
         raise PathreplayError(
             "The image requires that a part of the surface turns away from the light; enlarge the distance, reduce the "

@@ -51,7 +51,6 @@ class Lens:
         return not bends and abs(self.fy / self.fx - 1) * self.h / 2 <= OFF
 
     def describe(self) -> str:
-        """Describe the lens in words."""
         if self.fisheye:
             return "a fisheye lens"
         return "a distorting lens" if any(self.radial) or any(self.tangential) else "pixels that are not square"

@@ -49,7 +49,6 @@ class _Means:
     """Number of iterates."""
 
     def add(self, x: Array) -> None:
-        """Include one more iterate."""
         self.scatter, _ = self._ahead(x, store=True)
         self.count += 1
 

@@ -29,7 +29,6 @@ class Levels:
     begins: tuple[int, ...]
 
     def shape_at(self, iteration: int) -> tuple[int, ...]:
-        """Return the shape of the grid in an iteration."""
         return max((b, s) for b, s in zip(self.begins, self.shapes, strict=True) if b <= iteration)[1]
 
 

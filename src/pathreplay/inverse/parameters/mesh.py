@@ -46,13 +46,11 @@ class Surface:
         return len(self._copies) > self._matrix.shape[0]
 
     def latent(self, values: Array) -> Array:
-        """Compute u from v."""
         points = np.zeros((self._matrix.shape[0], 3))
         points[self._copies] = values.reshape(-1, 3)
         return self._spread(self._matrix @ points)
 
     def values(self, latent: Array) -> Array:
-        """Compute v from u."""
         points = np.zeros((self._matrix.shape[0], 3))
         points[self._copies] = latent.reshape(-1, 3)
         return self._spread(self._solver.solve(points))

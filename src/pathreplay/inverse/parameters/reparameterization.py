@@ -53,7 +53,6 @@ class Transform:
         self.upper = (1.0 if not np.isfinite(upper) else upper) if kind == "logit" else np.inf
 
     def require_inside(self, key: str, values: Array) -> None:
-        """Raise PathreplayError unless all values are strictly between the bounds."""
         for wrong, what in ((values <= self.lower, "above"), (values >= self.upper, "below")):
             if wrong.any():
                 bound = self.lower if what == "above" else self.upper

@@ -33,12 +33,10 @@ class Box:
 
     @property
     def size(self) -> np.ndarray:
-        """Lengths of the sides."""
         return np.subtract(self.high, self.low)
 
     @property
     def centre(self) -> np.ndarray:
-        """Centre of the box."""
         return np.add(self.low, self.high) / 2
 
 

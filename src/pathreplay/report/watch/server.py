@@ -126,7 +126,6 @@ class Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "pathreplay", ""
 
     def setup(self) -> None:
-        """Set the deadline for the request."""
         super().setup()
         self.rfile = io.BufferedReader(_Within(self.connection, PATIENCE))
 
