@@ -72,19 +72,23 @@ from pathlib import Path
 import pathreplay, mitsuba as mi
 from pathreplay.output.export import export_run
 mi.set_variant("llvm_ad_mono")
-pathreplay.minimize(pathreplay.load_job("../jobs/job.json"), output="run", progress=False)
-mi.set_variant("llvm_ad_rgb")
-export_run(Path("run"))
+pathreplay.minimize(pathreplay.load_job("../jobs/job.yaml"), output="of-problem", progress=False)
+pathreplay.optimize("../jobs/job.yaml", output="of-job", progress=False)
+for run in ("of-problem", "of-job"):
+    mi.set_variant("llvm_ad_rgb")
+    export_run(Path(run))
 """
 
 
-def test_a_run_tells_the_command_line_its_variant(place: Path, run_python: Callable[..., Any]) -> None:
+def test_runs_tell_the_command_line_their_variant(place: Path, run_python: Callable[..., Any]) -> None:
     """The job names none: then it is the active one, which the command line would not choose."""
-    written(place, {**JOB, "iterations": 1, "parameters": [{"key": KEY}], "target": {"values": {KEY: 0.4}, "spp": 2}})
+    job = {**JOB, "iterations": 1, "parameters": [{"key": KEY}], "target": {"values": {KEY: 0.4}, "spp": 2}}
+    (place / "job.yaml").write_text(json.dumps(job))
     done = run_python(OF_GREY)
     assert done.returncode == 0, done.stderr
-    assert json.loads(Path("run/config.json").read_text())["variant"] == "llvm_ad_mono"
-    assert json.loads(Path("run/export/values.json").read_text()).keys() == {KEY}
+    for run in ("of-problem", "of-job"):
+        assert json.loads(Path(run, "config.json").read_text())["variant"] == "llvm_ad_mono"
+        assert json.loads(Path(run, "export/values.json").read_text()).keys() == {KEY}
 
 
 def test_python_and_the_command_line_go_on_with_each_others_runs(place: Path) -> None:

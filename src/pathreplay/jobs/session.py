@@ -90,6 +90,10 @@ def _iterations(
             variant = backend.set_variant(config.variant)
         if config.deterministic:
             require_order(variant)
+        if config.variant is None and variant != backend.default_variant():
+            # The command line would resume and export the run in the default variant.
+            config = config.model_copy(update={"variant": variant})
+            job = replace(job, config=config, content=None)
         bar = progress_of(progress)
         stack.enter_context(bar)
         bar.say("preparing")

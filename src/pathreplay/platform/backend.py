@@ -164,7 +164,6 @@ def set_variant(name: str | None = None) -> str:
     run on this machine.
     """
     try:
-        import drjit as dr
         import mitsuba as mi
     except Exception as error:
         raise PathreplayError(
@@ -174,7 +173,7 @@ def set_variant(name: str | None = None) -> str:
         active = mi.variant()
         if active is not None and is_usable_variant(active):
             return str(active)
-        name = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
+        name = default_variant()
     _check_name(name, mi.variants())
     if name.startswith("llvm"):
         ensure_llvm()
@@ -186,6 +185,13 @@ def set_variant(name: str | None = None) -> str:
         reason = " ".join(str(error).split())
         raise PathreplayError(f"variant {name} does not run here ({reason}): see `pathreplay doctor`") from error
     return name
+
+
+def default_variant() -> str:
+    """Return the variant that `set_variant` sets if none is named and none is active."""
+    import drjit as dr
+
+    return "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
 
 
 def _check_name(name: str, known: list[str]) -> None:
