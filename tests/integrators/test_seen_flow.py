@@ -15,6 +15,8 @@ from edge_ordinary import PAINT, Moving, T, film, grey, hold_quiet, loaded, meas
 from edge_truth import hold_agreement
 from pathreplay.integrators import integrator as integrators
 from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film.camera_flow import Sample
+from pathreplay.integrators.film.surface_flow import NODES, SurfaceFlow
 from pathreplay.testing.objective import Objective
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
@@ -63,6 +65,21 @@ def on_a_floor(move: Any, camera: dict, **more: Any) -> Write:
     """A ball that moves over a floor, and its shadow."""
     parts = {"ball": ball(PAINT), "floor": floor(PAINT), "lamp": panel(), **more}
     return moving("ball.to_world", move, camera, **parts)
+
+
+def test_the_divergence_is_that_of_the_velocity_beyond_the_grid_as_well() -> None:
+    """On a film of few pixels, a sampled border extends beyond the grid."""
+    nodes = mi.Vector2f(np.random.default_rng(0).uniform(-1, 1, (2, NODES**2)))
+    flow = SurfaceFlow(mi.load_dict({"type": "perspective"}), nodes, mi.Bool(True))
+
+    def at(x: mi.Float, y: mi.Float) -> Sample:
+        return Sample(0.0, mi.Float(0.5), mi.Point2f(x, y), mi.Point2f(0.5))
+
+    x, y = mi.Float(0.52, -0.24, 0.52, 1.24, -0.24), mi.Float(0.27, 0.27, 1.24, 0.52, -0.24)
+    h = 1e-3
+    slopes = flow.velocity(at(x + h, y)).x - flow.velocity(at(x - h, y)).x
+    slopes += flow.velocity(at(x, y + h)).y - flow.velocity(at(x, y - h)).y
+    assert np.array(flow.divergence(at(x, y))) == pytest.approx(np.array(slopes / (2 * h)), abs=1e-2)
 
 
 CELLS: dict[str, Write] = {

@@ -112,8 +112,12 @@ class SurfaceFlow:
         return dr.lerp(dr.lerp(a, b, f.x), dr.lerp(c, d, f.x), f.y)
 
     def divergence(self, sample: Sample) -> mi.Float:
+        """Beyond the grid, the velocity does not change with the distance from the grid."""
         (a, b, c, d), f = self._corners(sample.position)
-        return CELLS * (dr.lerp(b.x - a.x, d.x - c.x, f.y) + dr.lerp(c.y - a.y, d.y - b.y, f.x))
+        along_x, along_y = dr.lerp(b.x - a.x, d.x - c.x, f.y), dr.lerp(c.y - a.y, d.y - b.y, f.x)
+        at = mi.Point2f(dr.detach(sample.position) * CELLS)
+        x_in, y_in = (dr.abs(x - CELLS / 2) < CELLS / 2 + MARGIN for x in (at.x, at.y))
+        return CELLS * (dr.select(x_in, along_x, 0) + dr.select(y_in, along_y, 0))
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
         """Return whether a moving surface is visible near a film position."""
