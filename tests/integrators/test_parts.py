@@ -40,11 +40,12 @@ def gradient(scene: mi.Scene, key: str, seed: Any, spp: int, grad_in: np.ndarray
     dr.disable_grad(params[key])
     dr.enable_grad(params[key])
     params.update()
-    integrator(**options).render_backward(scene, params, mi.TensorXf(grad_in), seed=seed, spp=spp)
-    found = get_array(dr.grad(params[key])).ravel()
-    dr.disable_grad(params[key])
-    params.update()
-    return found
+    try:
+        integrator(**options).render_backward(scene, params, mi.TensorXf(grad_in), seed=seed, spp=spp)
+        return get_array(dr.grad(params[key])).ravel()
+    finally:
+        dr.disable_grad(params[key])
+        params.update()
 
 
 @pytest.fixture
@@ -169,10 +170,18 @@ def test_what_cannot_be_counted_is_told_before_anything_is_launched() -> None:
     ):
         integrator().render(scene, seed=1, spp=1)
     scene = mi.load_dict(room(moves=True) | {"light": {"type": "point", "position": [0, 0, 6], "intensity": 9.0}})
-    with pytest.raises(PathreplayError, match=r"boundary_spp = 300000000 .* take boundary_spp up to 268435455, or 0"):
-        gradient(
-            scene, "ball.to_world", 1, 1, np.ones((4, 4, 3), np.float32), boundary="primary", boundary_spp=300_000_000
-        )
+    for boundary in ("primary", "auto"):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            with pytest.raises(
+                PathreplayError, match=r"boundary_spp = 300000000 .* take boundary_spp up to 268435455, or 0"
+            ):
+                gradient(
+                    scene, "ball.to_world", 1, 1, np.ones((4, 4, 3), np.float32), boundary=boundary,
+                    boundary_spp=300_000_000,
+                )  # fmt: skip
+            launched = [kernel["size"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
+        assert max(launched) < 16, launched  # 16 pixels; the values of parameters take smaller kernels
 
 
 def test_what_would_take_hours_is_refused_before_anything_is_launched(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,10 +107,15 @@ class Boundary(Term):
                 )
         return ""
 
+    @staticmethod
+    def require(view: Pass, spp: int) -> None:
+        """Raise PathreplayError if the edges of a pass cannot be searched with ``spp`` segments per pixel."""
+        if why := Boundary.obstacle(view):
+            raise PathreplayError(f"{why}, or use boundary = 'none'")
+        segments_of(view, FilmPlaces.of(view), spp)
+
     def _searches(self, view: Pass, trace: TraceConfig, places: FilmPlaces) -> Iterator[Edges]:
         """Run the edge searches that the scene and the options require, and yield the edges of each search."""
-        if why := self.obstacle(view):
-            raise PathreplayError(f"{why}, or use boundary = 'none'")
         trace = self.informed(view, trace)
         n, seed = segments_of(view, places, self.spp), Stream.BOUNDARY.of(view.opaque_seed)
         on_film, inner, length = max(n // FILM_CLOSER, 1), max(n // INNER_CLOSER, 1), FILM_LENGTH * places.detail

@@ -180,12 +180,16 @@ class PathReplayIntegrator(PathIntegrator):
         the flow does not contain. With ``follow``, the flow may follow visible surfaces (`SurfaceFlow`). The boundary
         term is left out if no edge moves, or if ``boundary = 'auto'`` and the term cannot be computed. The interior
         term is left out if `FilmMotion` is the whole derivative.
+
+        Raises PathreplayError, before any kernel is launched, if the boundary term is needed and cannot be computed.
         """
         view, trace, terms = PathIntegrator._planned(self, view, state)
         if self.boundary == "none":
             return view, trace, terms
         view = replace(view, flow=CameraFlow.of(view.scene, view.sensor))
         needs_edges = self._needs_edges(view, trace)
+        if needs_edges:
+            Boundary.require(view, self.boundary_spp)
         if needs_edges and follow and self._may_follow(view, trace):
             trace = Boundary.informed(view, trace)
             view = replace(view, flow=SurfaceFlow.of(view.sensor, trace))
