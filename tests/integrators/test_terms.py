@@ -197,6 +197,23 @@ def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:
     assert facts_of(other) is not facts_of(scene)
 
 
+def test_facts_keep_up_with_faces_in_another_order() -> None:
+    """Two quads that are folded at a seam: as many faces as before, and other smoothing groups."""
+    corners = [[0, -1, 0], [0, 1, 0], [-1, 1, 1], [-1, -1, 1], [0, -1, 0], [0, 1, 0], [1, 1, 1], [1, -1, 1]]
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]], np.uint32)
+    mesh = mi.Mesh("fold", 8, 4, has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"], params["faces"] = np.ravel(corners).astype(np.float32), faces.ravel()
+    params.update()
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "fold": mesh})
+    facts, params = SceneFacts(scene), mi.traverse(scene)
+    assert np.array(facts.tables().groups).tolist() == [0, 0, 0, 1, 1]
+    assert facts.tables().groups is facts.tables().groups
+    params["fold.faces"] = faces[[0, 2, 1, 3]].ravel()
+    params.update()
+    assert np.array(facts.tables().groups).tolist() == [0, 0, 1, 0, 1]
+
+
 def test_facts_tell_of_gradients_and_values_of_media(load) -> None:
     scene, params = load(foggy(), DENSITY)
     sensor = scene.sensors()[0]

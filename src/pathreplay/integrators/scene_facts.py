@@ -40,7 +40,7 @@ class SceneFacts:
         self._tables: Tables | None = None
         self._shapes = [node for node in nodes if isinstance(node, mi.Shape)]
         self._boxes = [shape.bbox() for shape in self._shapes]
-        self._sizes = _sizes(self._shapes)
+        self._faces = _faces(self._shapes)
         self._placed = scene.shapes()
         self._lights = scene.emitters()
         self._infinite = [light for light in self._lights if mi.has_flag(light.flags(), mi.EmitterFlags.Infinite)]
@@ -108,7 +108,7 @@ class SceneFacts:
 
     def tables(self) -> Tables:
         """Return the current lookup tables of BSDFs, shapes and emitters. Only changed tables are rebuilt."""
-        boxes, sizes = [shape.bbox() for shape in self._shapes], _sizes(self._shapes)
+        boxes, faces = [shape.bbox() for shape in self._shapes], _faces(self._shapes)
         if self._tables is None:
             self._tables = tables_of(self._traits.attachables, self._shapes, self._lights, self._bounding_box())
         elif boxes != self._boxes:
@@ -118,10 +118,10 @@ class SceneFacts:
             spheres = emitter_bounds(self._lights, self._shapes)
             if not np.array_equal(np.array(spheres), np.array(self._tables.emitter_bounds)):
                 self._tables = replace(self._tables, emitter_bounds=spheres)
-        if sizes != self._sizes:
+        if [array.index for array in faces] != [array.index for array in self._faces]:
             begins, groups = smoothing_groups_of(self._shapes)
             self._tables = replace(self._tables, groups_at=begins, groups=groups)
-        self._boxes, self._sizes = boxes, sizes
+        self._boxes, self._faces = boxes, faces
         return self._tables
 
     def recorded_tables(self, known: Tables | None, edges: bool) -> Tables:
@@ -158,8 +158,9 @@ def _kinds_with_constants() -> tuple[type, ...]:
     return mi.BSDF, mi.Texture, mi.Volume, mi.Medium, mi.PhaseFunction, mi.Emitter
 
 
-def _sizes(shapes: list[mi.Shape]) -> list[tuple[int, int]]:
-    return [(shape.vertex_count(), shape.face_count()) for shape in shapes if is_mesh(shape)]
+def _faces(shapes: list[mi.Shape]) -> list[mi.UInt32]:
+    """Return the faces of all meshes. New faces are another array, with another index as long as this one is kept."""
+    return [faces for shape in shapes if is_mesh(shape) and (faces := compat.faces_array(shape)) is not None]
 
 
 def _replaceable(scene: mi.Scene) -> list[mi.Object]:

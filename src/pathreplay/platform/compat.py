@@ -147,6 +147,17 @@ def mesh_arrays(params: Mapping[str, object]) -> MeshArrays | None:
     return MeshArrays(np.array(params[_FACES]).reshape(-1, 3), positions[at], normals, texcoords)
 
 
+def faces_array(mesh: mi.Mesh) -> mi.UInt32 | None:
+    """Return the faces of a mesh as a flat array of Dr.Jit, or None if they are not accessible (see `mesh_arrays`)."""
+    if hasattr(mesh, "faces_buffer"):  # faster, in 3.9
+        return mi.UInt32(mesh.faces_buffer())
+    params = mi.traverse(mesh)
+    if _FACES not in params:
+        return None
+    faces = params[_FACES]
+    return mi.UInt32(faces.array if dr.is_tensor_v(faces) else faces)
+
+
 def _rows(params: Mapping[str, object], names: tuple[str, str], width: int) -> NDArray[np.float32]:
     for name in names:
         if name in params:
