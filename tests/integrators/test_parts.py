@@ -73,6 +73,14 @@ def test_no_part_is_beyond_what_single_precision_holds(spp: int, side: int) -> N
     assert max(part.spp * side**2 for part in found) <= max(module.A_PART, module.LEAST_A_PIXEL * side**2)
 
 
+def test_image_and_gradient_of_mi_render_share_no_part(small: None) -> None:
+    """A gradient from paths of the image would be biased. `mi.render` derives the seed of the gradient as below."""
+    scene = mi.load_dict(room())
+    of_gradient = mi.sample_tea_32(mi.UInt32(SEED), mi.UInt32(1))[0]
+    found = [part for seed in (SEED, of_gradient) for part in parts(Pass.of(scene, 0, seed, SPP))]
+    assert len(found) >= 6 and len({int(mi.UInt32(part.seed)[0]) for part in found}) == len(found)
+
+
 @pytest.mark.parametrize("sampler", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"])
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 def test_parts_are_passes_with_seeds_of_their_own_and_their_mean_is_the_whole(

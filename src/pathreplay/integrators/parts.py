@@ -20,6 +20,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass, Seed
 from pathreplay.integrators.film.image import MOST_SAMPLES, film_size
 from pathreplay.platform.traversal import known_values
+from pathreplay.samplers.streams import Stream
 from pathreplay.scenes.parameters import SceneValue, is_transform
 
 # Largest number of samples of a pass that is not split. If all samples contribute equally, the relative rounding error
@@ -136,4 +137,4 @@ def rounded(sampler: mi.Sampler, count: int) -> int:
 
 
 def _seed(seed: Seed, part: int) -> Seed:
-    return seed if part == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(part))[0]
+    return seed if part == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(int(Stream.PARTS) + part))[0]

@@ -1,9 +1,10 @@
 """Streams: named, disjoint sequences of the counter-based samplers, one per purpose.
 
-Each stream has an integer value. The value is used in one of five ways, as the comments in `Stream` state:
+Each stream has an integer value. The value is used in one of six ways, as the comments in `Stream` state:
 
 - The stream has the seed ``seed ^ value``, or the key ``key ^ value`` (`Stream.of`).
 - The seed or key of the stream is a hash of the value and a seed.
+- The seed of the stream is a hash of the value plus an index, and a seed.
 - The value is the first index of the stream in the sequence of a key (`CounterSampler.stream`). The lowest indices,
   from 0 on, belong to the path itself, with six indices per vertex (see `CounterSampler.at_vertex`).
 - The value is added to the initial state of a generator.
@@ -30,6 +31,8 @@ class Stream(IntEnum):
     VOLUMETRIC_CENTRES = 0x1F83D9AB
     # The key of the stream is a hash of the value and the seed of the pass.
     PARTICLES = 0x68E31DA4
+    # The seed of the stream is a hash of the value plus the index of a part, and the seed of the pass.
+    PARTS = 0x6F4C21B0  # parts of a pass; `mi.render` hashes 1 and the seed of an image to the seed of its gradient
     # The key of the stream is the key of the path ^ the value.
     EMITTER_SEGMENTS = 0x1B873593
     ARCS = 0x38B34AE5
