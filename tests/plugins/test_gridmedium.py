@@ -180,6 +180,16 @@ def test_free_flight_covers_the_optical_depth_that_was_drawn(layout: dict[str, A
     assert (here[:, hit] <= m[hit] * (1 + 1e-5)).all()
 
 
+def test_cells_are_found_whose_index_exceeds_single_precision() -> None:
+    shape = (260, 260, 260)
+    marked = 1 + dr.arange(mi.UInt32, 8) + 260 * (258 + 260 * 258)
+    table = dr.zeros(mi.Float, 260**3)
+    dr.scatter(table, mi.Float(dr.arange(mi.UInt32, 8)), marked)
+    cells = grid_traversal.Cells(np.eye(3, 4), shape, table)
+    cell = mi.Vector3f(1 + dr.arange(mi.Float, 8), 258, 258)
+    assert dr.all(cells.lookup(mi.Float, cell, mi.Bool(True)) == dr.arange(mi.Float, 8))
+
+
 def test_free_flight_ends_for_any_ray() -> None:
     grid = medium(sparse(), 40, supergrid=True)
     nodes = np.linspace(-0.25, 1.25, 13)

@@ -10,6 +10,7 @@ Callers detach all inputs, except those of `through`. All functions can be used 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -32,6 +33,8 @@ DENSER = 2.0
 #: cells. Without the limit, the control density c would be the mean density of each cell, and the transmittance of
 #: dense grids with sharp edges would have extreme outliers.
 RISK = 0.1
+#: Largest number of cells whose indices single precision represents exactly.
+EXACT = 2**24
 #: Russian roulette is applied to transmittance estimates below this value. Russian roulette adds a variance of at most
 #: FAINT times the transmittance.
 FAINT = 1e-2
@@ -56,7 +59,8 @@ class Cells:
 
     def lookup(self, kind: type[T], cell: mi.Vector3f, active: mi.Bool) -> T:
         """Return the values of a cell (Vector3f of integers) as a Float or a vector."""
-        index = mi.UInt32(dr.fma(dr.fma(cell.z, self.shape[1], cell.y), self.shape[0], cell.x))
+        place = cell if math.prod(self.shape) <= EXACT else mi.Vector3u(cell)
+        index = mi.UInt32(dr.fma(dr.fma(place.z, self.shape[1], place.y), self.shape[0], place.x))
         return dr.gather(kind, self.table, index, active)
 
 
