@@ -668,6 +668,8 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
         pathreplay.minimize(compared, mi.ad.Adam(lr=0.1), steps=1, progress=False)
     with pytest.raises(PathreplayError, match="minimize: 'response' belongs to the problem; give it to Problem"):
         pathreplay.minimize(problem, response={"kind": "gamma"}, progress=False)
+    with pytest.raises(PathreplayError, match=r"'stages.0' is 'iterations': .*; write a table"):
+        pathreplay.minimize(problem, stages={"iterations": 2}, progress=False)
 
 
 @pytest.mark.parametrize("write", [pytest.param(s, id=s.__name__) for s in SCENES])

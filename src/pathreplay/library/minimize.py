@@ -122,7 +122,7 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
     """
     options, own = options_of(optimizer, problem.built.config.optimizer)
     settings |= {
-        "stages": None if stages is None else [dict(stage) for stage in stages],
+        "stages": None if stages is None else [dict(each) if isinstance(each, Mapping) else each for each in stages],
         "learning_rate_schedule": learning_rate_schedule,
         "final_learning_rate_ratio": final_learning_rate_ratio,
         "warmup_steps": warmup_steps,
