@@ -59,10 +59,10 @@ BALLS = [
 CASES = {each.name: each for each in (*BALLS, *scenes.BY_NAME.values(), *media.CELLS)}
 
 LEFT = {
-    "ball_in_fog": "one pass in 96 held 78 % of the variance; of what part is not known",
-    "cube_in_wall": "one pass in 256 held 13 % of the variance, nearly all of it the interior's",
-    "principled": "one pass in 256 held 31 % of the variance, nearly all of it the interior's",
-    "indirect_contact": "one pass in 256 held 23 % of the variance, nearly all of it the interior's",
+    "ball_in_fog": "one pass in 256 held 10 % of the variance: grazing camera rays, up to 1 / 0.01 times as far",
+    "cube_in_wall": "one pass in 256 held 17 % of the variance, nearly all of it that of edges seen from the wall",
+    "principled": "one pass in 256 held 10 % of the variance: light that the wall reflects, and a narrow lobe",
+    "indirect_contact": "one pass in 256 held 10 % of the variance",
 }
 """What has a tail still, and whence."""
 

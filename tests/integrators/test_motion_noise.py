@@ -38,8 +38,8 @@ from truth import (
 
 PASSES = 48
 MANY = 192
-# Of 192 normal deviations the largest makes 3 to 8 % of the variance; a distribution without variance, half or more.
-LARGEST = 0.5
+# Of 192 normal deviations the largest makes 3 to 8 % of the variance; a distribution without variance, a third or more.
+LARGEST = 0.25
 # The standard deviation of 48 normal numbers is within a factor of 1.6 of that of 192; rare large ones take it to 2.
 FEW, GROWTH = 48, 2.0
 INDEPENDENT = {"sampling": "scene"}  # where ways to take a derivative are compared, and nothing else
