@@ -150,7 +150,9 @@ def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
         return before
     name = f"Run {folder.name}"
     if run.optimiser.finished:
-        remedy = "lower the optimizer's tolerance" if folder.in_python else "lower 'tolerance'"
+        remedy = "lower the optimizer's tolerance"
+        if not folder.in_python:
+            remedy = "lower 'tolerance' in its config (Python: that of the optimizer)"
         raise PathreplayError(f"{name} has terminated ({run.optimiser.finished}); {remedy}")
     if len(run.history) >= config.iterations:
         remedy = "raise 'steps'" if folder.in_python else "raise 'iterations' in its config (Python: 'steps')"
