@@ -344,7 +344,7 @@ def test_the_cone_around_a_mesh_lamp_follows_it() -> None:
     ("kind", "place"), [("rectangle", scenes.OVERHEAD), ("sphere", scenes.T().translate([1.6, 1.2, 2.5]).scale(0.4))]
 )
 def test_the_texels_of_a_lamp_are_no_edges(kind: str, place: Any) -> None:
-    """Samples of a textured lamp jump from texel to texel. Its shadows move as those of a lamp without a texture."""
+    """Samples of a textured lamp jump between texels. Its shadows still move like those of a lamp without a texture."""
     texels = {**bitmap(np.full((8, 8, 3), 5)), "filter_type": "bilinear"}
     found = []
     for radiance in (5.0, texels):

@@ -154,7 +154,7 @@ def interrupted(problem: Problem) -> None:
 
 @pytest.mark.parametrize("call", [evaluated, stepped, interrupted])
 def test_a_scene_keeps_no_gradients(call: Callable[[Problem], None], photos: list[np.ndarray]) -> None:
-    """Forward mode in another scene would fail at them. The values are those of the last evaluation."""
+    """Gradients left in a scene break forward mode in other scenes. The scene keeps the values of the last call."""
     wanted = {TEXTURE: Parameter(initial=0.25), BODY: Parameter(pose="rigid")}
     problem = Problem(room(), wanted, views(photos), spp=1)
     call(problem)

@@ -189,7 +189,7 @@ def test_a_rectangle_light_grows_once() -> None:
 
 @pytest.mark.parametrize("copied", [False, True], ids=["itself", "copied"])
 def test_null_boundaries_are_skipped(copied: bool) -> None:
-    """Also those of a box in an instance."""
+    """The null boundary is that of a box, which may be in an instance."""
     place = mi.ScalarTransform4f().scale(0.4).translate([0, 0, 2])
     cube = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
     copy = {"group": {"type": "shapegroup", "fog": cube}, "copy": {"type": "instance", "of": GROUP}}

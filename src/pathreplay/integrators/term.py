@@ -45,5 +45,5 @@ class Term(Protocol):
         """Back-propagate the adjoint of the image into the parameters. On return, all kernels have been launched."""
 
     def note(self, trace: TraceConfig) -> str:
-        """Return a message about how the term is computed; "", the default, if there is none."""
+        """Return a message about how the term is computed. The default is "", which means that there is no message."""
         return ""

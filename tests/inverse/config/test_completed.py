@@ -69,7 +69,7 @@ NESTED = f'<integrator type="path"><integer name="max_depth" value="3"/>{HIDDEN}
     [("direct", HIDDEN, 2), ("aov", f'<string name="aovs" value="z:depth"/>{NESTED}', 3)],
 )
 def test_limits_of_integrators_without_limits_of_their_own(own: str, options: str, depth: int) -> None:
-    """Paths of `direct` have up to two segments. Limits of `aov` are those of the integrator in it."""
+    """Paths of `direct` have at most two segments. The limits of `aov` are those of the integrator that it contains."""
     scene = re.sub("<integrator.*</integrator>", f'<integrator type="{own}">{options}</integrator>', SCENE, flags=re.S)
     Path("scene.xml").write_text(scene)
     found = build_problem(make_config(JOB), Path.cwd())
