@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import PIL.Image
 import pytest
+from driven import attached
 
 from pathreplay.integrators.edge_notes import edges_note, moves_edges
 from pathreplay.inverse.images.io import over_black, read_image, transparent_share
@@ -85,6 +86,27 @@ def test_a_script_is_told_once(key: str, log: Any) -> None:
     told = [line for line in log.lines if "moving edges" in line]
     assert len(told) == (key in MOVE)
     assert all(key in line and "pathreplay check" in line for line in told)
+
+
+@pytest.mark.parametrize("far", [0.0, 2000.0])
+def test_a_script_is_told_of_edges_that_are_too_close_to_points(far: float, log: Any) -> None:
+    at = mi.ScalarTransform4f().translate([far, 0, 0])
+    scene = make_scene(cube={"type": "cube", "to_world": at})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    with attached(scene, "cube.vertex_positions"):
+        dr.backward(dr.mean(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=1), axis=None))
+    told = [line for line in log.lines if "left out, in a scene of size 2:" in line]
+    assert len(told) == (far > 0)
+
+
+def test_a_script_is_told_of_the_tables_of_roughplastic(log: Any) -> None:
+    scene = make_scene(cube={"type": "cube", "bsdf": {"type": "roughplastic"}})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    for key in ("cube.bsdf.diffuse_reflectance.value", "cube.bsdf.alpha"):
+        assert not [line for line in log.lines if "roughplastic" in line]
+        with attached(scene, key):
+            dr.backward(dr.mean(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=1), axis=None))
+    assert len([line for line in log.lines if "gradient of a roughplastic's alpha or eta" in line]) == 1
 
 
 XML = """<scene version="3.0.0">

@@ -6,7 +6,7 @@ The observer is a point on a surface or, in a medium, a real collision.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -33,9 +33,16 @@ from pathreplay.transport.volume.passage import (
     transmittance_up_to,
 )
 
+Largest = TypeVar("Largest", float, "mi.Float")
+
 NEAR = 10.0
 """Smallest usable distance of an edge, in units of the offset of ray origins. The offset then turns a ray by at most
 0.1 radians."""
+
+
+def omitted_distance(largest: Largest) -> Largest:
+    """Return the distance up to which edges are left out, for a surface point with this ``largest`` coordinate."""
+    return NEAR * mi.math.RayEpsilon * (1 + largest)
 
 
 def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool, mi.Spectrum]:
@@ -193,7 +200,7 @@ class ObserverVertex:
         Hits at smaller distances have inaccurate positions or are artefacts of rounding. Their reciprocal distance is
         unbounded.
         """
-        return t > NEAR * mi.math.RayEpsilon * (1 + dr.max(dr.abs(self.origin.p)))
+        return t > omitted_distance(dr.max(dr.abs(self.origin.p)))
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Return whether the direction from the observer to ``hit`` follows the hit point when the scene moves.

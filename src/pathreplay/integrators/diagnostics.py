@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import mitsuba as mi
 
+from pathreplay.boundary.observer import omitted_distance
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.edge_notes import edges_note, keys_that_move_edges
 from pathreplay.platform import compat
@@ -17,6 +18,25 @@ COST_OF_EDGES = (
     "boundary = 'primary' leaves out the edges that the camera does not see; see docs/boundary.md"
 )
 """Message about the cost of boundary terms that were enabled by default."""
+MOST_OMITTED = 0.02
+"""Largest `omitted_distance` that needs no message, as a fraction of the size of the scene."""
+
+
+def offset_note(box: mi.ScalarBoundingBox3f) -> str:
+    """Format the message about edges that are too close to surface points; "" if they hardly matter in this scene.
+
+    ``box`` is the bounding box of the scene. See `omitted_distance`.
+    """
+    if not box.valid():
+        return ""
+    size = max(float(x) for x in box.extents())
+    distance = omitted_distance(max(abs(float(x)) for corner in (box.min, box.max) for x in corner))
+    if distance <= MOST_OMITTED * size:
+        return ""
+    return (
+        f"edges that a surface point sees at a distance below {distance:.2g} are left out, in a scene of size "
+        f"{size:.2g}: Mitsuba's rays start at an offset that grows with the coordinates; move the scene to the origin, or enlarge it"
+    )
 
 
 def lost_note(lost: int, paths: int) -> str:
@@ -53,6 +73,11 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
         yield (
             "the opacity of a mask has gradients in a scene with media: its effect on emitter samples whose "
             "shadow rays cross the mask is missing from the gradient"
+        )
+    if traits.tables_move:
+        yield (
+            "the gradient of a roughplastic's alpha or eta is incomplete, and that of eta may have the wrong sign, "
+            "because Mitsuba does not differentiate the tables that it computes from them; see docs/gradients.md"
         )
     if trace.attach != "all":
         return

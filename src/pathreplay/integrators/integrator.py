@@ -25,6 +25,7 @@ from pathreplay.integrators.diagnostics import (
     doubts,
     lost_note,
     missing_edges,
+    offset_note,
     particle_notes,
     used_before_note,
 )
@@ -218,6 +219,8 @@ class PathReplayIntegrator(PathIntegrator):
             self._warn_once(f"{why}; they are left out here")
         elif self.boundary == "auto" and EDGES not in self.warned:
             self._warn_once(COST_OF_EDGES)
+        if not why and self.boundary != "primary" and (note := offset_note(view.scene.bbox())):
+            self._warn_once(note)
         return not why
 
     def is_recordable(self, has_media: bool) -> bool:

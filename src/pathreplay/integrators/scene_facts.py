@@ -14,6 +14,7 @@ from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
     INSTANCE,
     MASK,
+    PLASTIC,
     Tables,
     Traits,
     blend_lengths,
@@ -49,6 +50,7 @@ class SceneFacts:
         self._mesh_emitters = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
         self._masks = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == MASK]
+        self._plastics = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == PLASTIC]
         self._textures = [node for node in nodes if isinstance(node, mi.Texture)]
         self._seams: bool | None = None
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
@@ -103,6 +105,7 @@ class SceneFacts:
             lights_deform=any(with_gradients(mesh, *compat.POSITIONS) for mesh in self._mesh_emitters),
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
             opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
+            tables_move=any(with_gradients(plastic, "alpha", "eta") for plastic in self._plastics),
             lights_vary=any(map(with_gradients, self._emitters)),
         )
 

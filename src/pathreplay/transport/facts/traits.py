@@ -22,7 +22,7 @@ from pathreplay.transport.velocity import blend_length
 # BSDFs are identified by class name, because Mitsuba does not expose the properties that matter here. ATTACHABLE BSDFs
 # sample a direction that is a smooth function of the random numbers, and choose a lobe independently of all parameters.
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
-MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
+MASK, TWO_SIDED, PLASTIC = "MaskBSDF", "TwoSidedBRDF", "RoughPlastic"
 RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
 # BSDFs that have no narrow lobe of their own. BSDFs nested in them may have one.
@@ -87,6 +87,7 @@ class Traits:
     lights_deform: bool = False  # vertex positions of an emissive mesh
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
+    tables_move: bool = False  # the alpha or eta of a `roughplastic`, from which Mitsuba computes tables
     lights_vary: bool = False  # any parameter of an emitter, or of an emissive shape
     moving: tuple[mi.Shape, ...] | None = None  # shapes that may move; None: all shapes and the camera
 
