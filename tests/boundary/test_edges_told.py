@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 import PIL.Image
 import pytest
-from driven import attached
 
+from driven import attached
 from pathreplay.integrators.edge_notes import edges_note, moves_edges
 from pathreplay.inverse.images.io import over_black, read_image, transparent_share
 from pathreplay.jobs import make_config, optimize

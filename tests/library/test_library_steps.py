@@ -12,6 +12,7 @@ import pytest
 import pathreplay
 from library_scenes import GREY, OPTIMIZERS, SEARCHES, TEXTURE, WALL, Descent, photos_of_room, room, views
 from pathreplay import Parameter, PathreplayError, Problem, State, View
+from pathreplay.platform import memory
 from variant import VARIANT
 
 
@@ -60,6 +61,18 @@ def test_steps_are_those_of_minimize_and_change_no_state(name: str, photos: list
             assert frozen(state) == kept[n], (begin, n)
     assert [frozen(state) for state in states] == kept
     assert [len(state.history) for state in states] == list(range(6)) and "after 5 steps" in repr(states[-1])
+
+
+def test_functions_of_a_problem_keep_its_memory_limit(
+    photos: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = wall_of(photos, memory_limit="1 GB")
+    loss = pathreplay.value_and_grad(problem)
+    monkeypatch.setattr(memory, "taken", lambda: 2 * 10**9)
+    for evaluate in (loss, lambda: pathreplay.step(problem, pathreplay.init(problem))):
+        with pytest.raises(PathreplayError, match="uses 2 GB of memory, and its 'memory_limit' is 1 GB"):
+            evaluate()
+    memory.require_kept()
 
 
 def test_stages_and_schedules_are_those_of_minimize(photos: list[np.ndarray]) -> None:

@@ -20,7 +20,7 @@ from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Shard
 from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.inverse.problem.problem import Problem, build_problem
-from pathreplay.platform import backend
+from pathreplay.platform import backend, memory
 from pathreplay.platform.threads import one_thread
 from pathreplay.scenes.descriptions import errors_as
 
@@ -100,7 +100,8 @@ class RayActor:
         plugin = config.baseline if baseline and config.baseline is not None else config.integrator
         self.log.lines.clear()
         begin = time.perf_counter()
-        with one_thread(config.deterministic), errors_as(f"Integrator '{plugin.type}' cannot do this job"):
+        problem = f"Integrator '{plugin.type}' cannot do this job"
+        with one_thread(config.deterministic), errors_as(problem), memory.within(config.budget):
             evaluation = self._evaluator(baseline)(values, shard, learned)
         return Answer(evaluation, time.perf_counter() - begin, tuple(self.log.lines))
 

@@ -35,7 +35,8 @@ def offset_note(box: mi.ScalarBoundingBox3f) -> str:
         return ""
     return (
         f"edges that a surface point sees at a distance below {distance:.2g} are left out, in a scene of size "
-        f"{size:.2g}: Mitsuba's rays start at an offset that grows with the coordinates; move the scene to the origin, or enlarge it"
+        f"{size:.2g}: Mitsuba's rays start at an offset that grows with the coordinates; move the scene to the origin, "
+        "or enlarge it"
     )
 
 

@@ -93,6 +93,7 @@ class Problem:
         **settings: object,
     ) -> None:
         _require_none_of_views(settings)
+        _require_no_output("problem", settings)
         settings |= {"spp": spp, "learning_rate": learning_rate, "seed": seed, "deterministic": deterministic}
         self._build(settings, Path.cwd(), scene, parameters, views, loss, integrator, derived or {})
 
@@ -297,10 +298,16 @@ def _put(params: mi.SceneParameters, key: str, value: SceneValue) -> None:
 
 def run_settings(name: str, steps: int | None, options: Json | None, settings: Mapping[str, object]) -> Json:
     """Collect the settings of a run by job key, without those that are None. ``name`` starts error messages."""
+    _require_no_output(name, settings)
     if "iterations" in settings:
         raise PathreplayError(f"{name}: 'iterations' is called 'steps' here")
     given = {"iterations": steps, "optimizer": options, **settings}
     return {key: value for key, value in given.items() if value is not None}
+
+
+def _require_no_output(name: str, settings: Mapping[str, object]) -> None:
+    if settings.get("output") is not None:
+        raise PathreplayError(f"{name}: only minimize writes a run folder; give it 'output'")
 
 
 def _require_none_of_views(settings: Mapping[str, object]) -> None:
@@ -408,6 +415,7 @@ def load_job(
     """
     if views is not None:
         _require_none_of_views(settings)
+    _require_no_output("load_job", settings)
     table = read_table(Path(path), define)
     make_config(table, str(path))  # checks the file alone, so that error messages name the file
     table = {key: value for key, value in {**table, **settings}.items() if value is not None}

@@ -118,7 +118,7 @@ class Config(Table):
     deterministic: Switch = False
     """Make runs bitwise reproducible; this uses one thread and needs an LLVM variant."""
     memory_limit: Memory | None = None
-    """Memory that the run may use, such as '8 GiB'; default: all available memory."""
+    """Memory that each process of the run may use, such as '8 GiB'; default: all available memory."""
     executor: ExecutorName = "local"
     """Where shards are evaluated: in this process, or by Ray actors."""
     spp_shards: Count = 1

@@ -56,6 +56,7 @@ from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import Variable, free_of, keys_of, make_variables
 from pathreplay.inverse.problem import feasibility
 from pathreplay.inverse.problem.completed import completed
+from pathreplay.platform import memory
 from pathreplay.platform.threads import one_thread
 from pathreplay.platform.traversal import known_values, traversed
 from pathreplay.scenes import parameters
@@ -122,10 +123,14 @@ class Problem:
 
     @contextmanager
     def computing(self) -> Iterator[None]:
-        """Return a context that turns errors of integrators into PathreplayError. Deterministic jobs use one thread."""
+        """Return a context for renderings: it turns errors of integrators into PathreplayError, and limits the memory.
+
+        Deterministic jobs use one thread.
+        """
         config = self.config
         names = "' or '".join(plugin.type for plugin in (config.integrator, config.baseline) if plugin is not None)
-        with one_thread(config.deterministic), errors_as(f"Integrator '{names}' cannot do this job"):
+        problem = f"Integrator '{names}' cannot do this job"
+        with one_thread(config.deterministic), errors_as(problem), memory.within(config.budget):
             yield
 
     def moves(self, moving: frozenset[str]) -> set[str]:
