@@ -100,10 +100,15 @@ def test_gaps_of_few_samples_are_as_rare_as_their_deviates_say(seeds: int) -> No
     assert normal(6.2416, 11) == pytest.approx(4, abs=1e-4)  # a table's quantile of Student's distribution
 
 
-def test_the_error_that_would_have_shown_does_show() -> None:
-    right = verdict_on(1.0, 1.0, noise=0.05, n=200)
+@pytest.mark.parametrize(("n", "noise"), [(2, 1e-3), (3, 1e-3), (200, 0.05)])
+def test_the_error_that_would_have_shown_does_show(n: int, noise: float) -> None:
+    deviations = np.random.default_rng(7).standard_normal((2, n))
+    samples = 1 + noise * (deviations - deviations.mean(axis=1, keepdims=True))
+    right = judge(samples[0], samples[1], samples[1])
     assert right.verdict == "pass"
-    assert verdict_on(1.0 + 6 * right.resolution, 1.0, noise=0.05, n=200).verdict == "fail"
+    error = float(right.reason.split("above ")[1].split(" %")[0]) / 100
+    verdicts = [judge(samples[0] - share * error, samples[1], samples[1]).verdict for share in (0.9, 1.1)]
+    assert verdicts[0] == "pass" != verdicts[1]
 
 
 # ------------------------------------------------------------------------------

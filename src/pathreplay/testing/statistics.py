@@ -7,6 +7,7 @@ equally strict for 3 and for 300 seeds. All functions take numbers or arrays; sa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -46,11 +47,24 @@ def welch(difference: Numbers, σ: Numbers, *parts: tuple[Numbers, int]) -> Numb
     to σ are known exactly.
     """
     difference, σ = np.asarray(difference, np.float64), np.asarray(σ, np.float64)
-    noise = sum(np.asarray(error, np.float64) ** 4 / (n - 1) for error, n in parts)
+    freedom = _freedom(σ, parts)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(difference == 0, 0.0, np.abs(difference) / σ)
-        z = np.where(noise > 0, normal(t, σ**4 / noise), t)
+        z = np.where(freedom < np.inf, normal(t, freedom), t)
     return np.copysign(np.maximum(z, 0), difference)[()]
+
+
+def welch_limit(z: float, σ: float, *parts: tuple[Numbers, int]) -> float:
+    """Return the smallest difference whose normal deviate is at least z > 0: the inverse of `welch`."""
+    freedom = float(_freedom(np.asarray(σ, np.float64), parts))
+    return σ * (z if freedom == np.inf else float(stats.t.isf(stats.norm.sf(z), freedom)))
+
+
+def _freedom(σ: np.ndarray, parts: Sequence[tuple[Numbers, int]]) -> np.ndarray:
+    """Return the effective degrees of freedom of σ, which are infinite if no part of σ is estimated."""
+    noise = np.asarray(sum(np.asarray(error, np.float64) ** 4 / (n - 1) for error, n in parts))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(noise > 0, σ**4 / noise, np.inf)
 
 
 def normal(t: Numbers, freedom: Numbers) -> Numbers:

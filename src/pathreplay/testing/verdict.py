@@ -21,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 
-from pathreplay.testing.statistics import mean_and_error, welch
+from pathreplay.testing.statistics import mean_and_error, welch, welch_limit
 
 Verdict = Literal["pass", "zero", "fail", "inconclusive"]
 
@@ -89,7 +89,8 @@ def judge(
         return replace(known, reason="the reference is NaN or infinite: look at the image, or choose a smaller step")
 
     σ = math.sqrt(g_se**2 + r_se**2 + step_error**2 + (SUMMATION * scale) ** 2)
-    z = float(welch(g - r, σ, (g_se, gradient.size), (r_se, reference.size)))
+    parts = (g_se, gradient.size), (r_se, reference.size)
+    z = float(welch(g - r, σ, *parts))
     resolution = σ / scale if scale > 0 else math.inf
     verdict: Verdict
     if abs(z) >= Z_LIMIT:
@@ -98,7 +99,8 @@ def judge(
     elif resolution <= RESOLUTION and abs(g - r) > Z_LIMIT * RESOLUTION * scale:
         verdict, reason = "inconclusive", f"{gradient.size} seeds are too few for this difference; use more --seeds"
     elif resolution <= RESOLUTION:
-        verdict, reason = "pass", f"agrees; an error above {100 * Z_LIMIT * resolution:.2g} % would have shown"
+        least = min(welch_limit(Z_LIMIT, σ, *parts) / scale, Z_LIMIT * RESOLUTION)
+        verdict, reason = "pass", f"agrees; an error above {100 * least:.2g} % would have shown"
     elif scale <= Z_LIMIT * σ <= negligible or scale == σ == 0:
         verdict, reason = "zero", f"both are zero to within {Z_LIMIT * σ:.1g}, which is negligible in the image"
     else:
