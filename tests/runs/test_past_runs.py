@@ -20,7 +20,7 @@ from page_samples import HOSTILE
 from pathreplay.cli import app
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.loop.checkpoint import _HISTORY, Entry
-from pathreplay.jobs import make_config
+from pathreplay.jobs import make_config, optimize
 from pathreplay.report.live_page import FOLDER
 from pathreplay.report.pages.document import document
 from pathreplay.report.watch import compare, tensorboard, timelapse
@@ -67,6 +67,19 @@ def test_a_table_has_what_runs_came_to_and_where_they_differ(tmp_path: Path) -> 
     assert rows["loss"] == ("1 → 0.25 (l2)", "1 → 0.1 (l1)") and rows[f"error of {TEXTURE}"] == ("0.5", "0.2")
     assert rows["PSNR, test views"] == ("20.25 dB", "20.1 dB")
     assert rows["job: spp"] == ("4", "32") and rows["job: loss"] == ("'l2'", "'l1'") and len(rows) == 10
+
+
+def test_integrators_that_a_job_leaves_out_are_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With `--set`, the saved config is completed from the scene; otherwise it is the file."""
+    monkeypatch.chdir(tmp_path)
+    Path("job.toml").write_text(
+        'scene = "cornell-box"\niterations = 1\nspp = 1\n[target]\nscene = "cornell-box"\nspp = 1\n'
+        '[[parameters]]\nkey = "red.reflectance.value"\ninitial = 0.3\n'
+    )
+    for folder, changes in (("a", ()), ("b", ("learning_rate=0.5",))):
+        optimize(Path("job.toml"), output=folder, define=changes, progress=False)
+    names = [row.name for row in compare.table(pasts([Path("a"), Path("b")])).rows]
+    assert [name for name in names if name.startswith("job: ")] == ["job: learning_rate"]
 
 
 def test_a_page_has_curves_of_both_and_pictures_that_can_be_wiped(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.parsing import YAML
 from pathreplay.inverse.config.schema import Config, load_config
+from pathreplay.inverse.config.tables import Plugin
 from pathreplay.platform.atomic_files import Content, chunks
 from pathreplay.platform.files import file_problem
 from pathreplay.platform.interrupts import undisturbed
@@ -211,9 +212,12 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
         copy: dict[str, Content] = {name: job.content}
     else:
         copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
+    asked = job.config.target.integrator
     origin: Json = {
         "base": str(job.base.resolve()),
         "config": None if job.source is None else str(job.source),
+        "integrator": job.config.integrator.model_dump(mode="json"),
+        "target_integrator": None if asked is None else asked.model_dump(mode="json"),
     }
     if job.changes:
         origin["changes"] = list(job.changes)
@@ -236,7 +240,10 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
 
 
 class _Origin(BaseModel):
-    """Content of run.json. ``config`` is the path of the config file. The other fields are described in `Job`."""
+    """Content of run.json. ``config`` is the path of the config file. Most other fields are described in `Job`.
+
+    The integrators are those of the job and of its targets, also if the config file leaves them out (see `completed`).
+    """
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
@@ -244,6 +251,8 @@ class _Origin(BaseModel):
     config: str | None
     changes: list[str] = []
     in_python: bool = False
+    integrator: Plugin | None = None
+    target_integrator: Plugin | None = None
 
 
 def open_run_folder(path: Path, in_python: bool = False) -> tuple[Job, RunFolder]:
@@ -311,7 +320,13 @@ def _job(path: Path, copy: Path) -> Job:
         what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start a new run") from None
     source = None if origin.config is None else Path(origin.config)
-    return Job(load_config(copy), source, Path(origin.base), tuple(origin.changes), origin.in_python)
+    config = load_config(copy)
+    if origin.integrator is not None:
+        config = config.model_copy(update={"integrator": origin.integrator})
+    if origin.target_integrator is not None:
+        target = config.target.model_copy(update={"integrator": origin.target_integrator})
+        config = config.model_copy(update={"target": target})
+    return Job(config, source, Path(origin.base), tuple(origin.changes), origin.in_python)
 
 
 def new_output(output: str | Path | None, source: Path | None) -> Path:
