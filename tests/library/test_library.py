@@ -613,6 +613,10 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(output="run"), "problem: only minimize writes a run folder"),
         (lambda photos: pathreplay.init(Problem(room(), {WALL: GREY}, views(photos)), output="run"),
          "init: only minimize"),
+        (lambda photos: pathreplay.init(
+            Problem(room(), {WALL: GREY}, views(photos), integrator=mi.load_dict({"type": "pathreplay"})),
+            stages=[{"iterations": 1, "max_depth": 2}]),
+         "is a PathReplayIntegrator object, whose max_depth a stage cannot change"),
         (bad(loss="l3"), "No loss 'l3'"),
         (bad(loss=lambda a, b: "much"), "cannot be computed|returns the str"),
         (bad(loss=lambda a, b: dr.mean(dr.square(a - b), axis=None),

@@ -112,8 +112,9 @@ def require_stages(problem: Problem) -> None:
         for view in part.problem.trained().values():
             _require_divisible(problem.scene.sensors()[view.sensor], view.name, stage.downscale)
         if stage.max_depth is not None:
-            for plugin in filter(None, (config.integrator, config.baseline)):
-                _integrator(plugin, stage.max_depth)
+            for plugin, made in ((config.integrator, problem.integrator), (config.baseline, problem.baseline)):
+                if plugin is not None:
+                    _require_description(plugin, made, stage.max_depth)
     for variable in problem.variables:
         if config.stages and not any(variable.key in _moving(problem, stage) for stage in config.stages):
             raise PathreplayError(
@@ -161,6 +162,19 @@ def _require_divisible(sensor: mi.Sensor, name: str, downscale: int) -> None:
             f"stages: downscale = {downscale} does not divide the {width} x {height} pixels of sensor '{name}'; "
             f"{remedy}"
         )
+
+
+def _require_description(plugin: Plugin, made: mi.Integrator | None, max_depth: int) -> None:
+    """Raise PathreplayError if the integrator ``made`` cannot be created again with another ``max_depth``."""
+    try:
+        _integrator(plugin, max_depth)
+    except PathreplayError as error:
+        if plugin.type != type(made).__name__:
+            raise
+        raise PathreplayError(
+            f"stages: the integrator is a {plugin.type} object, whose max_depth a stage cannot change; give a "
+            "dictionary, such as {'type': 'pathreplay'}"
+        ) from error
 
 
 def _integrator(plugin: Plugin, max_depth: int) -> mi.Integrator:
