@@ -107,6 +107,14 @@ def test_scenes_that_share_a_parameter_take_turns() -> None:
     np.testing.assert_allclose(state.values[WALL], [0.7, 0.3, 0.2], atol=0.02)
 
 
+def test_an_optimizer_of_mitsuba_keeps_its_rate_in_every_problem(photos: list[np.ndarray]) -> None:
+    problems = [Problem(room(), {WALL: GREY}, views(photos), spp=4, learning_rate=rate) for rate in (0.03, 0.3)]
+    state = pathreplay.init(problems[0], mi.ad.Adam(lr=0.01))
+    for problem in problems:
+        after = pathreplay.step(problem, state)
+        np.testing.assert_allclose(np.abs(after._next[WALL] - state._next[WALL]), 0.01, rtol=1e-3)  # Adam's first step
+
+
 def test_a_finished_search_stays_where_it_is(photos: list[np.ndarray]) -> None:
     problem = wall_of(photos)
     state = pathreplay.init(problem, {"type": "l-bfgs-b", "tolerance": 0.5})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
 import drjit as dr
@@ -39,22 +39,24 @@ class Stepper(Protocol):
 class OfMitsuba:
     """`Optimiser` that is an object of `mitsuba.ad` or `drjit.opt`.
 
-    Variables in ``own`` use their learning rates in the problem. Other variables use the optimiser's learning rate, to
-    which the schedule and the stages of the problem apply as well. ``problem_rates`` are the learning rates of all
-    variables in the problem, before schedule and stages.
+    Parameters with a learning rate of their own use it. Other parameters use the optimiser's learning rate, to which
+    the schedule and the stages of the problem apply as well.
     """
 
     finished = ""
 
-    def __init__(
-        self, optimizer: Any, values: Arrays, own: Collection[str], problem_rates: Mapping[str, float]
-    ) -> None:
+    def __init__(self, optimizer: Any, values: Arrays, problem: Problem) -> None:
         if any(True for _ in optimizer.keys()):
             raise PathreplayError("optimizer: it already has variables; give an optimizer without variables")
-        self._optimizer, self._own, self._steps = optimizer, own, dict.fromkeys(values, 0)
-        self._problem_rates = problem_rates
+        self._optimizer, self._steps = optimizer, dict.fromkeys(values, 0)
+        self.use(problem)
         for key, value in values.items():
             optimizer[key] = mi.TensorXf(value)
+
+    def use(self, problem: Problem) -> None:
+        """Take the learning rates of this problem, before schedule and stages, for the next steps."""
+        self._own = _rated(problem)
+        self._problem_rates = {v.key: v.learning_rate for v in problem.variables}
 
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
@@ -181,8 +183,7 @@ def adapted(optimizer: Any, problem: Problem, values: Arrays) -> Optimiser:
     if not hasattr(optimizer, "step"):
         return optimiser_of(problem, values, problem.config.optimizer, optimizer)
     if hasattr(optimizer, "set_learning_rate") and hasattr(optimizer, "keys"):
-        rates = {v.key: v.learning_rate for v in problem.variables}
-        return OfMitsuba(optimizer, latents(problem.variables, values), _rated(problem), rates)
+        return OfMitsuba(optimizer, latents(problem.variables, values), problem)
     return OfUser(optimizer, values)
 
 

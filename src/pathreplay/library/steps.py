@@ -17,7 +17,7 @@ from pathreplay.inverse.optim import adaptive
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import latents
 from pathreplay.inverse.problem import problem as inner
-from pathreplay.library.optimizers import Stepper, adapted, options_of
+from pathreplay.library.optimizers import OfMitsuba, Stepper, adapted, options_of
 from pathreplay.library.problem import Problem, run_settings
 
 
@@ -58,6 +58,8 @@ class _Task:
         if self.optimiser is None or self.at is not state:
             self.optimiser = self.own or optimiser_of(built, state._next, built.config.optimizer)
             self.optimiser.restore(state._kept, latents(built.variables, state._next))
+        if isinstance(self.optimiser, OfMitsuba):
+            self.optimiser.use(built)
         self.at = None  # a failed step would leave the optimiser in an unknown state; a successful step sets `at` again
         return self.optimiser
 
