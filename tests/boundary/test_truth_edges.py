@@ -8,7 +8,8 @@ from edge_scenes import ALL_MOVE, BENT, SEEN, TOUCHING
 from edge_truth import hold_forward, hold_gradients, hold_need, loaded, ours, some
 from truth import TRANSPOSE_MAX
 
-NAMES = pytest.mark.parametrize("name", some([*SEEN, *TOUCHING, *BENT]))
+CELLS = [*SEEN, *TOUCHING, *BENT]
+NAMES = pytest.mark.parametrize("name", some(CELLS))
 
 
 @NAMES
@@ -21,7 +22,8 @@ def test_forward_is_reverse(name: str) -> None:
     hold_forward(name)
 
 
-@NAMES
+# In "facet_seen", sampled directions follow the plane of the facet, so that the interior is the whole derivative.
+@pytest.mark.parametrize("name", some([case for case in CELLS if case.name != "facet_seen"]))
 def test_without_edges_they_do_not(name: str) -> None:
     hold_need(name)
 

@@ -13,6 +13,7 @@ import pytest
 
 from edge_ordinary import (
     LENS,
+    PAINT,
     UPRIGHT,
     WINDOW,
     Moving,
@@ -22,6 +23,7 @@ from edge_ordinary import (
     loaded,
     measured,
     moved_camera,
+    panel,
     room,
     sensor,
 )
@@ -29,6 +31,7 @@ from edge_truth import hold_agreement
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film import camera_flow as film_flow
 from pathreplay.integrators.film import motion as film_motion
+from pathreplay.integrators.film.grid import NODES
 from pathreplay.integrators.film.motion import FilmMotion
 from pathreplay.integrators.term import TermResult
 from pathreplay.testing.objective import smooth_weights
@@ -130,20 +133,38 @@ def test_the_rest_of_a_camera_that_turns_is_rounding(tmp_path: Path, monkeypatch
 
 @pytest.mark.slow
 def test_the_gradient_is_that_of_any_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The distance at which nothing moves over the film decides which term tells of the motion, and not what it is."""
+    """The distance at which nothing moves over the film decides which term tells of the motion, and not what it is.
+
+    It may also be another at every node.
+    """
     objective = loaded(moved_camera(sensor())(tmp_path), tmp_path)
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
     found = []
-    for r in (2.0, 8.0):
-        monkeypatch.setattr(film_flow, "_distance", lambda scene, sensor, r=r: mi.Float(r))
+    for low, high in ((0.5, 0.5), (0.125, 0.125), (0.15, 0.35)):
+        nodes = mi.Float(np.random.default_rng(3).uniform(low, high, NODES**2).astype(np.float32))
+        monkeypatch.setattr(film_flow, "_closeness", lambda scene, sensor, nodes=nodes: nodes)
         found.append(np.array([objective.backward(integrator, seed, 256) for seed in range(SEEDS)]))
     objective.put(dr.opaque(mi.Float, 0))
-    hold_agreement("camera, flows at two distances", *found, 0.0)
+    for other in found[1:]:
+        hold_agreement("camera, flows at two distances", found[0], other, 0.0)
 
 
 @pytest.mark.parametrize("name", ["point", pytest.param("gaussian", marks=pytest.mark.slow)])
 def test_noise_is_below_that_of_a_difference(name: str, tmp_path: Path) -> None:
     hold_quiet(PLACES[name](tmp_path), tmp_path)
+
+
+def around(light: dict, **parts: Any) -> Write:
+    """A camera that goes around something small, before nothing or a sky."""
+    ball = {"type": "sphere", "to_world": T().translate([0.2, 0.1, 0]).scale(0.5), "bsdf": PAINT}
+    scene = {"type": "scene", "camera": sensor(), "ball": ball, "light": light, **parts}
+    return lambda folder: Moving(scene, "camera.to_world", rotate(0.3, 1, 0))
+
+
+@pytest.mark.parametrize("light", [panel(), {"type": "constant"}], ids=["lamp", "sky"])
+def test_noise_is_low_around_a_thing_before_a_background(light: dict, tmp_path: Path) -> None:
+    """The background has no edges, so that only the distance of the thing counts."""
+    hold_quiet(around(light)(tmp_path), tmp_path)
 
 
 def test_on_a_large_film_neighbours_cancel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

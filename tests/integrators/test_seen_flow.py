@@ -16,7 +16,8 @@ from edge_truth import hold_agreement
 from pathreplay.integrators import integrator as integrators
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.camera_flow import Sample
-from pathreplay.integrators.film.surface_flow import NODES, SurfaceFlow
+from pathreplay.integrators.film.grid import NODES
+from pathreplay.integrators.film.surface_flow import SurfaceFlow
 from pathreplay.testing.objective import Objective
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT

@@ -27,6 +27,7 @@ from typing import Protocol, TypeAlias
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.integrators.film.grid import CELLS, NODES, PROBES, Cell, NodeSums, interpolated, probe_position
 from pathreplay.transport.facts.nodes import with_gradients
 
 PINHOLE = "PerspectiveCamera"
@@ -38,9 +39,8 @@ OTHERS = "to_world", "focus_distance", "aperture_radius"
 STEP = 1 / 256
 """Step of central differences, in film widths. The derivatives have a relative error of 4e-6 for a field of view of
 40°, and of 1e-4 for 120°."""
-PROBES = 16
-"""Number of probe rays per row and column of the film, which measure distances to the scene."""
-
+K_0 = 1e3
+"""Weight of the mean closeness of all visible surfaces, at each node."""
 
 RayDerivatives: TypeAlias = "tuple[list[mi.Vector3f], list[mi.Vector3f]]"
 """∂o/∂s and ∂d/∂s of a ray, along both axes of the film."""
@@ -103,7 +103,7 @@ class CameraFlow:
     """The flow of a moving sensor: see `FilmFlow`."""
 
     sensor: mi.Sensor
-    r: mi.Float  # distance r from the origin of a ray to the point p (see the module)
+    closeness: mi.Float  # at the nodes of a grid (see `grid`), the reciprocal of the distance r (see the module)
     leaves_rest: bool  # whether rays have motion that the flow does not contain
     is_all: bool
     samples: int = 2
@@ -116,7 +116,9 @@ class CameraFlow:
         rest = _is_carried(sensor) or bool(with_gradients(sensor, *OTHERS[1:]))
         others = any(with_gradients(node) for node in (*scene.shapes(), *scene.emitters()))
         alone = not (rest or others or with_gradients(sensor, "medium"))
-        return CameraFlow(sensor, _distance(scene, sensor), rest, alone)
+        # Without a rest, the flow does not depend on the distance.
+        closeness = _closeness(scene, sensor) if rest else dr.full(mi.Float, 1, NODES * NODES)
+        return CameraFlow(sensor, closeness, rest, alone)
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         ray, weight = sample.ray(self.sensor)
@@ -124,18 +126,25 @@ class CameraFlow:
             return ray, weight
         if not self.leaves_rest:
             return dr.detach(ray), weight
-        derivatives = ray_derivatives(self.sensor, sample)
-        move_with_position(ray, derivatives, self._velocity(ray, derivatives))
+        move_with_position(ray, ray_derivatives(self.sensor, sample), self.velocity(sample))
         return ray, weight
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
-        return self._velocity(sample.ray(self.sensor)[0], ray_derivatives(self.sensor, sample))
+        cell = Cell.at(sample.position)
+        return self._velocity(sample, interpolated(cell.corners(self.closeness), cell.f))
 
     def divergence(self, sample: Sample) -> mi.Float:
-        total = mi.Float(0)
+        """Compute the divergence by central differences.
+
+        The closeness is extrapolated from the cell of the sample, because its derivative jumps between cells.
+        """
+        cell, total = Cell.at(sample.position), mi.Float(0)
+        corners = cell.corners(self.closeness)
         for axis, step in enumerate((mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP))):
-            before, after = (self.velocity(sample.at(sample.position + side * step))[axis] for side in (-1, 1))
-            total += (after - before) / (2 * STEP)
+            for side in (-1, 1):
+                closeness = interpolated(corners, cell.f + side * CELLS * cell.inside * step)
+                v = self._velocity(sample.at(sample.position + side * step), closeness)
+                total += side * v[axis] / (2 * STEP)
         return total
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
@@ -149,10 +158,11 @@ class CameraFlow:
     def carry_tangents(self) -> None:
         """Do nothing: the terms differentiate the sensor itself, so this flow has no arrays with tangents."""
 
-    def _velocity(self, ray: mi.Ray3f, derivatives: RayDerivatives) -> mi.Vector2f:
-        """Compute the `velocity` from an attached ray and its derivatives along the film's axes."""
-        δp = (ray.o - dr.detach(ray.o)) + self.r * (ray.d - dr.detach(ray.d))
-        return -film_velocity(δp, derivatives, self.r)
+    def _velocity(self, sample: Sample, closeness: mi.Float) -> mi.Vector2f:
+        """Compute the `velocity` at which the rays keep passing through points of a given closeness."""
+        ray, r = sample.ray(self.sensor)[0], dr.rcp(closeness)
+        δp = (ray.o - dr.detach(ray.o)) + r * (ray.d - dr.detach(ray.d))
+        return -film_velocity(δp, ray_derivatives(self.sensor, sample), r)
 
 
 def film_velocity(δp: mi.Vector3f, derivatives: RayDerivatives, t: mi.Float) -> mi.Vector2f:
@@ -170,15 +180,10 @@ def move_with_position(ray: mi.Ray3f, derivatives: RayDerivatives, v: mi.Vector2
     ray.d += d[0] * v.x + d[1] * v.y
 
 
-def probes_of(sensor: mi.Sensor, n: int) -> Sample:
-    """Return the samples of n x n probe rays through the cell centres of a grid on the film, row by row."""
-    i = dr.arange(mi.UInt32, n * n)
-    return Sample(sensor.shutter_open(), mi.Float(0.5), probe_position(i, n), mi.Point2f(0.5))
-
-
-def probe_position(i: mi.UInt32, n: int) -> mi.Point2f:
-    """Return the film position of a probe ray by its index: see `probes_of`."""
-    return (mi.Point2f(i % n, i // n) + 0.5) / n
+def probes_of(sensor: mi.Sensor) -> Sample:
+    """Return the samples of the probe rays: see `probe_position`."""
+    i = dr.arange(mi.UInt32, PROBES * PROBES)
+    return Sample(sensor.shutter_open(), mi.Float(0.5), probe_position(i), mi.Point2f(0.5))
 
 
 def ray_derivatives(sensor: mi.Sensor, sample: Sample) -> RayDerivatives:
@@ -206,10 +211,20 @@ def _is_carried(sensor: mi.Sensor) -> bool:
         return any(dr.grad_enabled(pose.matrix[row, 3]) for pose in poses for row in range(3))
 
 
-def _distance(scene: mi.Scene, sensor: mi.Sensor) -> mi.Float:
-    """Return the harmonic mean of the distances to visible surfaces, since parallax is proportional to 1 / distance."""
+def _closeness(scene: mi.Scene, sensor: mi.Sensor) -> mi.Float:
+    """Return the mean of the reciprocal distances of the surfaces that are visible near each node (see `grid`).
+
+    Parallax is proportional to reciprocal distances. Rays that miss all surfaces do not count: edges move with the
+    surfaces in front of a background, and a background has no edges of its own.
+    """
     with dr.suspend_grad():
-        ray, _ = probes_of(sensor, PROBES).ray(sensor)
+        ray, _ = probes_of(sensor).ray(sensor)
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
-        closeness = dr.mean(dr.select(hit.is_valid(), dr.rcp(hit.t), 0))
-        return dr.select(closeness > 0, dr.rcp(closeness), 1)
+        visible = hit.is_valid()
+        closeness = dr.select(visible, dr.rcp(hit.t), 0)
+        mean = dr.sum(closeness) / dr.maximum(dr.count(visible), 1)
+        dr.eval(closeness, visible, mean)
+        sums = NodeSums.of(dr.select(visible, mi.Float(1), 0))
+        nodes = (K_0 * mean + sums.of_values(closeness)) / (K_0 + sums.total())
+        dr.eval(nodes)
+        return dr.select(nodes > 0, nodes, 1)

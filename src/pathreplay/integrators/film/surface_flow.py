@@ -25,7 +25,6 @@ and boundary terms have to differentiate little motion.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import drjit as dr
 import mitsuba as mi
@@ -36,23 +35,18 @@ from pathreplay.integrators.film.camera_flow import (
     Sample,
     film_velocity,
     move_with_position,
-    probe_position,
     probes_of,
     ray_derivatives,
 )
+from pathreplay.integrators.film.grid import CELLS, Cell, NodeSums, interpolated, is_near
 from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.meet import meet
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.vertex import TraceConfig
 
-PROBES, CELLS = 32, 16
-"""Number of probe rays and number of grid cells per row and column of the film."""
-MARGIN = 2
-"""Number of nodes outside each border of the film, where filters still have support."""
-NODES = CELLS + 1 + 2 * MARGIN
-REACH, NEAR, K_0 = 0.25, 0.03, 1e3
-"""REACH and NEAR in film widths; K_0 is a weight that favours fixed film positions."""
+K_0 = 1e3
+"""Weight that favours fixed film positions."""
 GRAZING, NARROW = 0.1, 0.004
 """GRAZING is the cosine below which W levels off. NARROW is S times the square of the film's width in radians."""
 
@@ -70,7 +64,7 @@ class SurfaceFlow:
     @staticmethod
     def of(sensor: mi.Sensor, trace: TraceConfig) -> SurfaceFlow | None:
         """Create the flow of a sensor; None if no visible surface moves. ``trace`` contains the moving shapes."""
-        sample = probes_of(sensor, PROBES)
+        sample = probes_of(sensor)
         ray = mi.Ray3f(sample.ray(sensor)[0])
         hit = meet(trace, ray, mi.Bool(True), coherent=True)
         visible, t = hit.is_valid(), dr.select(hit.is_valid(), hit.t, 1)
@@ -87,17 +81,12 @@ class SurfaceFlow:
             moves = visible & may_move(trace, hit)
             dr.eval(u, W, moves)  # evaluate once: every node gathers from these arrays
 
-            index = dr.arange(mi.UInt32, NODES * NODES * PROBES * PROBES)
-            node, i = index // (PROBES * PROBES), index % (PROBES * PROBES)
-            r2 = dr.squared_norm(mi.Point2f(_cell_of(node)) / CELLS - probe_position(i, PROBES))
-            K = dr.square(dr.maximum(1 - r2 / REACH**2, 0) / (r2 + NEAR**2)) * dr.gather(mi.Float, W, i)
-            total = K_0 + _sums(K)
-            nodes = mi.Vector2f(*(_sums(dr.select(K > 0, K * dr.gather(mi.Float, u[k], i), 0)) / total for k in (0, 1)))
-        moved = _sums(dr.select(dr.gather(mi.Bool, moves, i), K, 0))
+            sums = NodeSums.of(W)
+            total = K_0 + sums.total()
+            nodes = mi.Vector2f(*(sums.of_values(u[k]) / total for k in (0, 1)))
+        moved = sums.of_values(dr.select(moves, mi.Float(1), 0)) > 0
         dr.eval(nodes, moved)
-        cell, flows = _cell_of(dr.arange(mi.UInt32, NODES * NODES)), mi.Bool(False)
-        for x, y in product(range(-1, 3), repeat=2):
-            flows |= dr.gather(mi.Float, moved, _node(cell, x, y)) > 0
+        flows = is_near(moved)
         dr.eval(flows)
         return SurfaceFlow(sensor, nodes, flows)
 
@@ -108,20 +97,19 @@ class SurfaceFlow:
         return ray, weight
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
-        (a, b, c, d), f = self._corners(sample.position)
-        return dr.lerp(dr.lerp(a, b, f.x), dr.lerp(c, d, f.x), f.y)
+        cell = Cell.at(sample.position)
+        return interpolated(cell.corners(self.nodes), cell.f)
 
     def divergence(self, sample: Sample) -> mi.Float:
         """Beyond the grid, the velocity does not change with the distance from the grid."""
-        (a, b, c, d), f = self._corners(sample.position)
+        cell = Cell.at(sample.position)
+        (a, b, c, d), f = cell.corners(self.nodes), cell.f
         along_x, along_y = dr.lerp(b.x - a.x, d.x - c.x, f.y), dr.lerp(c.y - a.y, d.y - b.y, f.x)
-        at = mi.Point2f(dr.detach(sample.position) * CELLS)
-        x_in, y_in = (dr.abs(x - CELLS / 2) < CELLS / 2 + MARGIN for x in (at.x, at.y))
-        return CELLS * (dr.select(x_in, along_x, 0) + dr.select(y_in, along_y, 0))
+        return CELLS * (along_x * cell.inside.x + along_y * cell.inside.y)
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
         """Return whether a moving surface is visible near a film position."""
-        return dr.gather(mi.Bool, self.flows, _node(_cell_at(position)[0], 0, 0))
+        return dr.gather(mi.Bool, self.flows, Cell.at(position).first_node())
 
     def leaves_rest_at(self, position: mi.Point2f) -> mi.Bool:
         """Return whether the camera ray through a film position may move: see `FilmFlow`.
@@ -134,11 +122,6 @@ class SurfaceFlow:
         with dr.resume_grad():
             tangents(self.nodes)
 
-    def _corners(self, position: mi.Point2f) -> tuple[list[mi.Vector2f], mi.Point2f]:
-        """Return the velocities at the corners of the cell that contains a position, and the position in the cell."""
-        cell, f = _cell_at(position)
-        return [dr.gather(mi.Vector2f, self.nodes, _node(cell, x, y)) for y in (0, 1) for x in (0, 1)], f
-
 
 def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     """Return whether film positions may follow visible surfaces.
@@ -150,26 +133,3 @@ def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     traits = trace.traits
     hidden = traits.mirrors or traits.veils or traits.splines
     return trace.media is None and not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)
-
-
-def _sums(values: mi.Float) -> mi.Float:
-    """Sum over all probe rays, for each node."""
-    return dr.block_sum(values, PROBES * PROBES)
-
-
-def _cell_at(position: mi.Point2f) -> tuple[mi.Point2i, mi.Point2f]:
-    """Return the cell of a film position and the coordinates in the cell, clamped to the grid."""
-    at = dr.clip(dr.detach(position) * CELLS, -MARGIN, CELLS + MARGIN)
-    cell = dr.minimum(mi.Point2i(dr.floor(at)), CELLS + MARGIN - 1)
-    return cell, at - mi.Point2f(cell)
-
-
-def _cell_of(node: mi.UInt32) -> mi.Point2i:
-    """Return the cell whose first corner is a node."""
-    return mi.Point2i(node % NODES, node // NODES) - MARGIN
-
-
-def _node(cell: mi.Point2i, x: int, y: int) -> mi.UInt32:
-    """Return the row-major index of the node at (x, y) relative to the first node of a cell, clamped to the grid."""
-    at = dr.clip(cell + mi.Point2i(x + MARGIN, y + MARGIN), 0, NODES - 1)
-    return mi.UInt32(at.x + at.y * NODES)
