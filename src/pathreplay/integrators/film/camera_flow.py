@@ -14,9 +14,10 @@ weights, where n is the normal of the border of D (see `FilmMotion`):
 The second part is the derivative of L that the motion of the ray c(T, π) causes. The derivative of this ray is
 ∂c/∂π + ∂c/∂s v, the *rest* of the motion. The sum of both parts is correct for any smooth v.
 
-`CameraFlow` chooses v such that each ray keeps passing through the point p = o + r d at a distance r:
-v = -(∂p/∂s)⁺ ∂p/∂π. The rest is then zero for a rotation and for a change of the field of view. For a translation, the
-rest is the parallax. For a static camera, `SurfaceFlow` chooses v such that film positions follow the visible surfaces.
+`CameraFlow` chooses v such that each ray keeps passing through the point p = o + r d: v = -(∂p/∂s)⁺ ∂p/∂π. The distance
+r is a mean over surfaces that are visible nearby. The rest is then zero for a rotation and for a change of the field of
+view. For a translation, the rest is the parallax. For a static camera, `SurfaceFlow` chooses v such that film positions
+follow the visible surfaces.
 """
 
 from __future__ import annotations
