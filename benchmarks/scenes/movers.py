@@ -47,6 +47,10 @@ def _turn(value: Any, t: mi.Float) -> Any:
     return mi.Transform4f(value) @ mi.Transform4f().rotate([0.3, 1, 0], dr.rad2deg(t))
 
 
+def _go_around(value: Any, t: mi.Float) -> Any:
+    return mi.Transform4f().rotate([0.3, 1, 0], dr.rad2deg(t)) @ mi.Transform4f(value)
+
+
 def _turn_vertices(value: Any, t: mi.Float) -> Any:
     return dr.ravel(mi.Transform4f().rotate([0.3, 1, 0], dr.rad2deg(t)) @ dr.unravel(mi.Point3f, value))
 
@@ -200,6 +204,7 @@ MOVERS: dict[str, Mover] = {
     "textured ball": Mover(_scene(object=_textured_ball, sky=_environment), _slide(1, 0.3, 0)),
     "heights": Mover(_scene(_aslant, object=_heights, lamp=_lamp, sky=lambda: SKY), _rise),
     "camera turns": Mover(_scene(**_mesh_and_ball), _turn),
+    "camera around a head": Mover(_scene(object=lambda: _head([0, 0, 0], 0.7), sky=lambda: SKY), _go_around),
     "orthographic camera": Mover(_scene(_parallel, **_mesh_and_ball), _slide(1, 0.3, 0)),
     "field of view": Mover(_scene(**_mesh_and_ball), _widen),
     "behind rough glass": Mover(_scene(wall=_wall, object=_box, lamp=_lamp, glass=_rough_glass), _slide_vertices),

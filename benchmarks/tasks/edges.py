@@ -45,6 +45,7 @@ MOVING = {
     "textured ball": (PLACE, 3),
     "heights": (*KEY, 3),
     "camera turns": (LOOK_FROM, 3),
+    "camera around a head": (LOOK_FROM, 3),
     "orthographic camera": (LOOK_FROM, 3),
     "field of view": ("camera.x_fov", 3),
     "behind rough glass": (*KEY, 5),
