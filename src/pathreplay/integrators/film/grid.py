@@ -82,12 +82,18 @@ class Cell:
         """Return the values at the four corners of the cell."""
         return [dr.gather(type(nodes), nodes, node_at(self.first, x, y)) for y in (0, 1) for x in (0, 1)]
 
+    def slopes(self, corners: list[Value]) -> tuple[Value, Value]:
+        """Return the derivatives of interpolated values along both axes of the film; 0 beyond the grid."""
+        (a, b, c, d), f = corners, self.f
+        along_x, along_y = dr.lerp(b - a, d - c, f.y), dr.lerp(c - a, d - b, f.x)
+        return along_x * (CELLS * self.inside.x), along_y * (CELLS * self.inside.y)
+
     def first_node(self) -> mi.UInt32:
         return node_at(self.first, 0, 0)
 
 
 def interpolated(corners: list[Value], f: mi.Point2f) -> Value:
-    """Interpolate between the corners of a cell linearly; outside of the cell, extrapolate."""
+    """Interpolate linearly between the values at the corners of a cell."""
     a, b, c, d = corners
     return dr.lerp(dr.lerp(a, b, f.x), dr.lerp(c, d, f.x), f.y)
 

@@ -38,7 +38,7 @@ from pathreplay.integrators.film.camera_flow import (
     probes_of,
     ray_derivatives,
 )
-from pathreplay.integrators.film.grid import CELLS, Cell, NodeSums, interpolated, is_near
+from pathreplay.integrators.film.grid import Cell, NodeSums, interpolated, is_near
 from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.meet import meet
@@ -103,9 +103,8 @@ class SurfaceFlow:
     def divergence(self, sample: Sample) -> mi.Float:
         """Beyond the grid, the velocity does not change with the distance from the grid."""
         cell = Cell.at(sample.position)
-        (a, b, c, d), f = cell.corners(self.nodes), cell.f
-        along_x, along_y = dr.lerp(b.x - a.x, d.x - c.x, f.y), dr.lerp(c.y - a.y, d.y - b.y, f.x)
-        return CELLS * (along_x * cell.inside.x + along_y * cell.inside.y)
+        along_x, along_y = cell.slopes(cell.corners(self.nodes))
+        return along_x.x + along_y.y
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
         """Return whether a moving surface is visible near a film position."""
