@@ -154,10 +154,10 @@ def test_noise_is_below_that_of_a_difference(name: str, tmp_path: Path) -> None:
     hold_quiet(PLACES[name](tmp_path), tmp_path)
 
 
-def around(light: dict, **parts: Any) -> Write:
+def around(light: dict) -> Write:
     """A camera that goes around something small, before nothing or a sky."""
     ball = {"type": "sphere", "to_world": T().translate([0.2, 0.1, 0]).scale(0.5), "bsdf": PAINT}
-    scene = {"type": "scene", "camera": sensor(), "ball": ball, "light": light, **parts}
+    scene = {"type": "scene", "camera": sensor(), "ball": ball, "light": light}
     return lambda folder: Moving(scene, "camera.to_world", rotate(0.3, 1, 0))
 
 

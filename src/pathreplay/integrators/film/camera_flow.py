@@ -127,12 +127,12 @@ class CameraFlow:
             return ray, weight
         if not self.leaves_rest:
             return dr.detach(ray), weight
-        move_with_position(ray, ray_derivatives(self.sensor, sample), self.velocity(sample))
+        derivatives = ray_derivatives(self.sensor, sample)
+        move_with_position(ray, derivatives, self._velocity(ray, derivatives, self._closeness_at(sample.position)))
         return ray, weight
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
-        cell = Cell.at(sample.position)
-        return self._velocity(sample, interpolated(cell.corners(self.closeness), cell.f))
+        return self._velocity_of(sample, self._closeness_at(sample.position))
 
     def divergence(self, sample: Sample) -> mi.Float:
         """Compute the divergence by central differences, at fixed closeness and by closeness."""
@@ -141,9 +141,10 @@ class CameraFlow:
         closeness = interpolated(corners, cell.f)
         for axis, step in enumerate((mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP))):
             samples = (sample.at(sample.position + side * step) for side in (-1, 1))
-            before, after = (self._velocity(other, closeness)[axis] for other in samples)
+            before, after = (self._velocity_of(other, closeness)[axis] for other in samples)
             total += (after - before) / (2 * STEP)
-        less, more = (self._velocity(sample, closeness * (1 + side * STEP)) for side in (-1, 1))
+        ray, derivatives = sample.ray(self.sensor)[0], ray_derivatives(self.sensor, sample)
+        less, more = (self._velocity(ray, derivatives, closeness * (1 + side * STEP)) for side in (-1, 1))
         return total + dr.dot(more - less, mi.Vector2f(*cell.slopes(corners))) / (2 * STEP * closeness)
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
@@ -157,11 +158,21 @@ class CameraFlow:
     def carry_tangents(self) -> None:
         """Do nothing: the terms differentiate the sensor itself, so this flow has no arrays with tangents."""
 
-    def _velocity(self, sample: Sample, closeness: mi.Float) -> mi.Vector2f:
-        """Compute the `velocity` at which the rays keep passing through points of a given closeness."""
-        ray, r = sample.ray(self.sensor)[0], dr.rcp(closeness)
+    def _closeness_at(self, position: mi.Point2f) -> mi.Float:
+        cell = Cell.at(position)
+        return interpolated(cell.corners(self.closeness), cell.f)
+
+    def _velocity_of(self, sample: Sample, closeness: mi.Float) -> mi.Vector2f:
+        return self._velocity(sample.ray(self.sensor)[0], ray_derivatives(self.sensor, sample), closeness)
+
+    def _velocity(self, ray: mi.Ray3f, derivatives: RayDerivatives, closeness: mi.Float) -> mi.Vector2f:
+        """Compute the `velocity` at which an attached ray keeps passing through the point of a given closeness.
+
+        ``derivatives`` are those of the ray along the film's axes.
+        """
+        r = dr.rcp(closeness)
         δp = (ray.o - dr.detach(ray.o)) + r * (ray.d - dr.detach(ray.d))
-        return -film_velocity(δp, ray_derivatives(self.sensor, sample), r)
+        return -film_velocity(δp, derivatives, r)
 
 
 def film_velocity(δp: mi.Vector3f, derivatives: RayDerivatives, t: mi.Float) -> mi.Vector2f:
