@@ -9,7 +9,7 @@ import threading
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -181,6 +181,38 @@ def test_a_frozen_step_of_a_user_in_which_geometry_moves(rendered: bool, edges: 
     expected, found = gradients(step, False), gradients(dr.freeze(step), rendered)
     for a, b in zip(expected, found, strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-3, atol=1e-4 * np.abs(a).max())
+
+
+class Collecting:
+    """A variable of a frozen function that collects garbage whenever the function reads it but the first time."""
+
+    DRJIT_STRUCT: ClassVar = {"value": mi.Float}
+
+    def __init__(self) -> None:
+        self._value, self._reads = mi.Float(1), 0
+
+    @property
+    def value(self) -> mi.Float:
+        self._reads += 1
+        if self._reads > 1:
+            gc.collect()
+        return self._value
+
+    @value.setter
+    def value(self, value: mi.Float) -> None:
+        self._value = value
+
+
+def test_no_scene_is_released_while_a_frozen_function_looks_at_its_variables() -> None:
+    scene, by, collecting = cornell(), integrator(), Collecting()
+
+    @dr.freeze
+    def step(seed: mi.UInt32) -> mi.TensorXf:
+        return mi.render(scene, integrator=by, spp=4, seed=seed) * collecting.value
+
+    with without_collector():
+        gradient(cornell(), integrator())
+        assert np.array(step(mi.UInt32(0))).max() > 0
 
 
 def in_threads(work: Any, count: int = 3) -> None:

@@ -11,7 +11,8 @@ including the objects of other scenes. Four rules follow, which this module enfo
    released before the pass.
 3. No scene is freed while `dr.freeze` records. Freeing a scene launches a host function, which cannot be recorded and
    crashes the process. No scene is therefore released during a recording, and objects that may have become garbage are
-   hidden from the collector until the recording has ended.
+   hidden from the collector until the recording has ended. Before and after a recording, `dr.freeze` traverses the
+   registry twice and raises an error if the number of objects has changed. No scene is released in between either.
 4. Only one Python thread renders at a time. All threads of a process share Dr.Jit's registry and memory. Threads that
    trace or launch kernels concurrently get wrong results or crash the process. A pass therefore raises an error if
    another thread has a pass in progress; `exclusive` lets threads take turns.
@@ -178,12 +179,27 @@ def _on_collection(phase: str, info: dict[str, int]) -> None:
             if phase == "start" and _hidden:
                 gc.unfreeze()
                 _hidden = False
-            elif phase == "stop":
+            elif phase == "stop" and not _within_drjit():
                 SCENES.release()
         finally:
             _ONE_THREAD.release()
     finally:
         _AT_COLLECTION.release()
+
+
+def _within_drjit() -> bool:
+    """Return whether this thread is in Dr.Jit's or Mitsuba's Python code, or traces a loop or a virtual function call.
+
+    Objects may then be in use that no Python variable refers to, by other integrators or by a frozen function.
+    """
+    if dr.flag(dr.JitFlag.SymbolicScope):
+        return True
+    frame = sys._getframe()
+    while frame is not None:
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in ("drjit", "mitsuba"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _at_exit() -> None:
