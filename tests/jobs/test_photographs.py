@@ -227,6 +227,13 @@ def test_stages_fit_into_the_time() -> None:
     assert all(stage.iterations >= LEAST for stage in plan.stages + short.stages)
 
 
+def test_a_fast_machine_renders_more_samples_in_about_the_same_number_of_iterations() -> None:
+    slow, fast = (plan_stages(Speed(speed, 0.05, 1.0), 30, 40, 160, 280, "job.toml").stages for speed in (9e6, 200e6))
+    assert [stage.downscale for stage in slow] == [stage.downscale for stage in fast]
+    for a, b in zip(slow, fast, strict=True):
+        assert b.spp > a.spp and 0.7 * a.iterations < b.iterations < 2 * a.iterations
+
+
 @pytest.mark.slow
 def test_from_photos_to_a_mesh(wall_capture: Path, tmp_path: Path) -> None:
     """Images come close to the photos, and plain Mitsuba shows the ball in front of the wall."""

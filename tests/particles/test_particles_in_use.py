@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from pathreplay.jobs import optimize
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
 from recorded_steps import steps
+from variant import SPECTRAL
 
 PARTICLES = {"type": "pathreplay_particles", "max_depth": 3, "boundary": "none"}
 CAUSTICS = {"type": "pathreplay", "max_depth": 4, "boundary": "none", "caustics": "particles"}
@@ -127,16 +129,16 @@ def test_what_light_paths_cannot_render_is_refused_in_one_line(case: str, plugin
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-SPECTRA = """
+SPECTRA = f"""
 from pathreplay.platform.backend import set_variant
-set_variant("llvm_ad_spectral")
+set_variant("{SPECTRAL}")
 import mitsuba as mi
-band = {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}
-film = {"type": "specfilm", "width": 4, "height": 4, "band": band}
-eye = {"type": "perspective", "fov": 40, "film": film, "id": "eye"}
-scene = mi.load_dict({"type": "scene", "eye": eye, "lamp": {"type": "point"}})
+band = {{"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}}
+film = {{"type": "specfilm", "width": 4, "height": 4, "band": band}}
+eye = {{"type": "perspective", "fov": 40, "film": film, "id": "eye"}}
+scene = mi.load_dict({{"type": "scene", "eye": eye, "lamp": {{"type": "point"}}}})
 try:
-    mi.load_dict({"type": "pathreplay_particles"}).render(scene, spp=1)
+    mi.load_dict({{"type": "pathreplay_particles"}}).render(scene, spp=1)
 except Exception as error:
     print(type(error).__name__, error)
 """
@@ -178,8 +180,8 @@ def test_derivatives_of_unbounded_paths_are_refused(plugin: dict) -> None:
     assert mi.load_dict(unbounded).render(scene, spp=1).shape == (HEIGHT, WIDTH, 3)
     with pytest.raises(PathreplayError) as caught:
         gradient(scene, unbounded, "floor.bsdf.reflectance.value")
-    message = "max_depth = -1 (unbounded) is more than the record of a light path can hold: take up to 2049 where"
-    assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
+    message = r"max_depth = -1 \(unbounded\) is more than the record of a light path can hold: take up to \d+ where .*"
+    assert re.fullmatch(message, str(caught.value))
 
 
 # ------------------------------ Which parameters reach them ------------------------------
