@@ -27,6 +27,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import FrameType
 from typing import Generic, TypeVar
 
 import drjit as dr
@@ -194,7 +195,7 @@ def _within_drjit() -> bool:
     """
     if dr.flag(dr.JitFlag.SymbolicScope):
         return True
-    frame = sys._getframe()
+    frame: FrameType | None = sys._getframe()
     while frame is not None:
         if str(frame.f_globals.get("__name__")).partition(".")[0] in ("drjit", "mitsuba"):
             return True
