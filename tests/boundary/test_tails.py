@@ -19,8 +19,11 @@ import edge_media_scenes as media
 import edge_ordinary
 import edge_scenes as scenes
 from edge_truth import ours
+from pathreplay.boundary import secondary
 from pathreplay.boundary.arcs import Arc
 from pathreplay.testing.objective import Objective
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import Z_LIMIT
 from pathreplay.transport.signature import turned_away
 from truth import Bench, add, translate
 
@@ -157,6 +160,24 @@ def test_arcs_longer_than_a_lobe_is_wide_have_a_tail() -> None:
     assert several.max() < 0.1 * one.max()
     broad = crossings(1.0, narrow=False)
     assert crossings(1.0, narrow=True).std() < 1.1 * broad.std()
+
+
+@pytest.mark.slow
+def test_several_searches_around_a_vertex_are_less_noisy_than_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A moving shape that a rough conductor reflects: the same sum, and less variance."""
+    bench = Bench(scenes.BY_NAME["indirect_rough"])
+    bench.weigh(scenes.weights())
+    found = []
+    try:
+        for arcs in (1, secondary.ARCS):
+            monkeypatch.setattr(secondary, "ARCS", arcs)
+            integrator = ours(bench)
+            found.append(np.array([bench.backward(integrator, 1000 * arcs + seed, SPP) for seed in range(64)]))
+    finally:
+        bench.release()
+    one, several = found
+    assert abs(gap(one, several).z) < Z_LIMIT
+    assert several.var() < 0.8 * one.var()
 
 
 def test_only_a_mesh_turns_away() -> None:

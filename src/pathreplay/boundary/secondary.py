@@ -7,16 +7,15 @@ jumps from f_near to f_far. The boundary term of the scattered radiance J contai
 
     dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
 
-One vertex x of each camera path is selected. Short segments find the edges (see `crofton`). Segments in the unit square
-of emitter samples find changes of the emitter's visibility. Segments that are arcs of directions around BSDF samples
-find changes of the visible surface. The integrands of both kinds of samples include their MIS weights, so that the two
-boundary terms add up. The motion of x is propagated along the path. If x is static, edges between static surfaces are
-ignored.
+One vertex x of each camera path is selected. Short segments find the edges (see `crofton`). A segment in the unit
+square of emitter samples finds changes of the emitter's visibility. Arcs of directions around BSDF samples find changes
+of the visible surface. The integrands of both kinds of samples include their MIS weights, so that the two boundary
+terms add up. The motion of x is propagated along the path. If x is static, edges between static surfaces are ignored.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -37,19 +36,22 @@ from pathreplay.transport.vertex import TraceConfig
 UNGUIDED = 0.8
 """Fraction of pilot segments that are not concentrated at cast shadows, because shadows seen in reflections and
 refractions lie at other film positions."""
+ARCS = 4
+"""Number of arcs around a vertex with a narrow lobe. Other vertices have one arc, because the shadows that they see are
+found in the squares of emitters."""
 
 
 @dataclass
 class CameraPath:
-    """A camera path to a vertex. Two segments of the vertex are searched for edges.
+    """A camera path to a vertex, around which segments are searched for edges.
 
-    One segment lies in the unit square of an emitter, and the other is an arc of directions.
+    One segment lies in the unit square of an emitter. All others are arcs of directions.
     """
 
     s: mi.Point2f  # film position
     density: mi.Float  # density of ``s``, per pixel
     key: mi.UInt32  # seed of the path's random numbers
-    on_arc: mi.Bool  # whether the lane bisects the arc instead of the segment in the square
+    number: mi.UInt32  # the segment that the lane bisects: 0 for the segment in the square, i for the i-th arc
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,8 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         importances = self._importances(pilot)
         radiance = radiance_of(importances)
         importance = weighed(importances, radiance)[1]
-        s = mi.Point2f(*(dr.concat([x, x]) for x in pilot.s))
-        relative_density = dr.concat([pilot.density, pilot.density]) * (density.width * density.height)
+        s = mi.Point2f(*(dr.concat([x] * (1 + self.most_arcs)) for x in pilot.s))
+        relative_density = dr.concat([pilot.density] * (1 + self.most_arcs)) * (density.width * density.height)
         mean_importance = dr.rcp(
             dr.maximum(dr.sum(dr.select(importance > 0, dr.rcp(relative_density), 0)), dr.smallest(mi.Float))
         )
@@ -94,13 +96,14 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
         """Draw the path of segment ``i``: see `EdgeSearch`.
 
-        Indices below ``n`` denote segments in emitter squares, and indices from ``n`` to 2 n - 1 denote arcs. Segment i
-        and arc n + i have the same path.
+        Indices below ``n`` denote segments in emitter squares. The following indices denote arcs: first one arc of each
+        path, then a second arc of each path, and so on. The segments with indices i, n + i, 2 n + i, ... belong to the
+        same path.
         """
-        on_arc = i >= n
-        i = dr.select(on_arc, i - n, i)
+        number = i // n
+        i -= number * n
         s, density = self.density.draw(*quasi_random(i, n, seed))
-        return CameraPath(s, density, key_of(i, Stream.SECONDARY_KEYS.of(seed)), on_arc)
+        return CameraPath(s, density, key_of(i, Stream.SECONDARY_KEYS.of(seed)), number)
 
     def detect(self, segments: CameraPath) -> mi.Float:
         """Return the importance of all segments in emitter squares, followed by the importance of all arcs."""
@@ -114,9 +117,10 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         records, x = self._vertex(segments, layout, records)
         x.active &= weight > 0
         observer = ObserverVertex(self.trace, x)
-        square, arc = self._segments(observer, segments.key)
-        shadow = square.resolve(dr.select(segments.on_arc, 0, weight), generator)
-        sides = arc.resolve(dr.select(segments.on_arc, weight, 0), generator)
+        on_arc = segments.number > 0
+        shadow = self._square(observer, segments.key).resolve(dr.select(on_arc, 0, weight), generator)
+        arc = self._arc(observer, segments.key, segments.number)
+        sides = arc.resolve(dr.select(on_arc, weight / self._arcs(observer), 0), generator)
         path = EdgePath(segments.s, segments.key, dr.select(x.active, x.k, 0), x.at.ray, layout, records)
         return Edges(path, [*sides, shadow], observer)
 
@@ -128,20 +132,46 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         x.β *= weight / path.density
         return records, x
 
-    def _segments(self, observer: ObserverVertex, key: mi.UInt32) -> tuple[EmitterSegment, ArcSegment]:
-        (square, arc), active = self.lengths, observer.active
+    @property
+    def most_arcs(self) -> int:
+        """Largest number of arcs around a vertex."""
+        return ARCS if self.trace.traits.narrow else 1
+
+    def _arcs(self, observer: ObserverVertex) -> mi.UInt32:
+        """Return the number of arcs around a vertex."""
+        return dr.select(observer.keeps_direction, mi.UInt32(self.most_arcs), 1)
+
+    def _square(self, observer: ObserverVertex, key: mi.UInt32) -> EmitterSegment:
+        return EmitterSegment.draw(observer, self.lengths[0], Stream.EMITTER_SEGMENTS.of(key))
+
+    def _arc(self, observer: ObserverVertex, key: mi.UInt32, number: mi.UInt32) -> ArcSegment:
         narrow = self.trace.traits.narrow or self.trace.media is not None
-        return (
-            EmitterSegment.draw(observer, square, Stream.EMITTER_SEGMENTS.of(key)),
-            ArcSegment.draw(observer, arc, narrow, Stream.ARCS.of(key), active),
-        )
+        key = Stream.ARCS.of(key)
+        if self.most_arcs > 1:
+            key = key_of(number, key)
+        return ArcSegment.draw(observer, self.lengths[1], narrow, key, observer.active)
 
     def _importances(self, path: CameraPath) -> list[Importance]:
         """Estimate the importance of the segments in emitter squares, and of the arcs."""
         _, x = self._vertex(path, None, None)
         none = dr.zeros(mi.Float, dr.width(path.key))
         path.density += none  # broadcast to the number of paths
-        importances = [segment.detect() for segment in self._segments(ObserverVertex(self.trace, x), path.key)]
-        importances = [replace(w, presence=w.presence / path.density, edges=w.edges + none) for w in importances]
-        dr.eval(path.s, path.density, importances)
-        return importances
+        observer, n = ObserverVertex(self.trace, x), dr.width(path.key)
+        square = self._square(observer, path.key).detect()
+        square = replace(square, presence=square.presence / path.density, edges=square.edges + none)
+        arcs = Importance(*(dr.zeros(mi.Float, n * self.most_arcs) for _ in fields(Importance)))
+        self._detect_arcs(observer, path, n, arcs)
+        dr.eval(path.s, path.density, square, arcs)
+        return [square, arcs]
+
+    @dr.syntax
+    def _detect_arcs(self, observer: ObserverVertex, path: CameraPath, n: int, found: Importance) -> None:
+        """Write the importance of all arcs of ``n`` paths to ``found``, in the order of `draw`."""
+        search, arcs, number = self, self._arcs(observer), dr.full(mi.UInt32, 0, n)
+        while dr.hint(number < arcs, exclude=[search, observer, path, found], label="pathreplay: arcs"):
+            arc = search._arc(observer, path.key, number + 1).detect()
+            i = number * n + dr.arange(mi.UInt32, n)
+            dr.scatter(found.presence, arc.presence / (path.density * arcs), i)
+            dr.scatter(found.edges, arc.edges / arcs, i)
+            dr.scatter(found.light, arc.light / arcs, i)
+            number += 1

@@ -27,8 +27,9 @@ from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
-FILM_CLOSER, INNER_CLOSER = 5, 16
-"""Number of probed segments per bisected segment, in searches on the film and in secondary searches."""
+FILM_CLOSER, INNER_CLOSER, NARROW_CLOSER = 5, 16, 8
+"""Number of paths per bisected segment: in searches on the film, in secondary searches, and in secondary searches in
+scenes with narrow lobes, where paths have more arcs."""
 GRID = "SDFGrid"
 """Class of shapes whose silhouettes cannot be sampled. Rays miss them near the outline, and points on them cannot be
 kept at fixed surface coordinates."""
@@ -118,13 +119,14 @@ class Boundary(Term):
         """Run the edge searches that the scene and the options require, and yield the edges of each search."""
         trace = self.informed(view, trace)
         n, seed = segments_of(view, places, self.spp), Stream.BOUNDARY.of(view.opaque_seed)
-        on_film, inner, length = max(n // FILM_CLOSER, 1), max(n // INNER_CLOSER, 1), FILM_LENGTH * places.detail
+        on_film, length = max(n // FILM_CLOSER, 1), FILM_LENGTH * places.detail
         if self.film:
             yield PrimarySearch.of(trace, places, length).find(n, on_film, seed)
             if trace.media is not None and trace.traits.hard_lights:
                 yield VolumetricSearch.of(trace, places, length).find(n, on_film, seed)
         if self.inner:
-            yield SecondarySearch.of(trace, places, INNER_LENGTHS).find(n, inner, seed)
+            inner = n // (NARROW_CLOSER if trace.traits.narrow else INNER_CLOSER)
+            yield SecondarySearch.of(trace, places, INNER_LENGTHS).find(n, max(inner, 1), seed)
 
 
 def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
