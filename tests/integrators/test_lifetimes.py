@@ -183,18 +183,32 @@ def test_a_frozen_step_of_a_user_in_which_geometry_moves(rendered: bool, edges: 
         np.testing.assert_allclose(b, a, rtol=1e-3, atol=1e-4 * np.abs(a).max())
 
 
+def test_tables_of_a_moving_mesh_have_one_alignment() -> None:
+    """A frozen function is recorded again if the alignment of an array changes."""
+    scene = mi.load_dict(lit_box(cube8)(), optimize=False)
+    params, found = mi.traverse(scene), set()
+    positions = mi.Float(params["object.vertex_positions"])
+    for k in range(8):
+        params["object.vertex_positions"] = positions * (1 + 0.1 * k)
+        params.update()
+        tables = facts_of(scene).tables()
+        arrays = tables.blend_lengths, tables.groups, tables.groups_at, tables.scene_bounds, tables.emitter_bounds
+        found |= {np.from_dlpack(array).ctypes.data % 64 for array in arrays}
+    assert found == {0}
+
+
 class Collecting:
-    """A variable of a frozen function that collects garbage whenever the function reads it but the first time."""
+    """A variable of a frozen function. Every read except the first one triggers a garbage collection."""
 
     DRJIT_STRUCT: ClassVar = {"value": mi.Float}
 
     def __init__(self) -> None:
-        self._value, self._reads = mi.Float(1), 0
+        self._value, self.reads = mi.Float(1), 0
 
     @property
     def value(self) -> mi.Float:
-        self._reads += 1
-        if self._reads > 1:
+        self.reads += 1
+        if self.reads > 1:
             gc.collect()
         return self._value
 
@@ -203,7 +217,7 @@ class Collecting:
         self._value = value
 
 
-def test_no_scene_is_released_while_a_frozen_function_looks_at_its_variables() -> None:
+def test_no_scene_is_released_while_a_frozen_function_is_called() -> None:
     scene, by, collecting = cornell(), integrator(), Collecting()
 
     @dr.freeze
@@ -211,8 +225,33 @@ def test_no_scene_is_released_while_a_frozen_function_looks_at_its_variables() -
         return mi.render(scene, integrator=by, spp=4, seed=seed) * collecting.value
 
     with without_collector():
-        gradient(cornell(), integrator())
+        dropped = cornell()
+        gradient(dropped, integrator())
+        facts = weakref.ref(facts_of(dropped))
+        del dropped
         assert np.array(step(mi.UInt32(0))).max() > 0
+        assert collecting.reads > 1 and facts() is not None
+        gc.collect()
+        assert facts() is None
+
+
+@pytest.mark.parametrize("tracing", ["loop", "other thread"])
+def test_no_scene_is_released_while_other_code_traces(tracing: str) -> None:
+    with without_collector():
+        dropped = cornell()
+        gradient(dropped, integrator())
+        facts, alive = weakref.ref(facts_of(dropped)), []
+        del dropped
+
+        def body(i: mi.UInt32) -> tuple[mi.UInt32]:
+            in_threads(lambda n: gc.collect(), 1) if tracing == "other thread" else gc.collect()
+            alive.append(facts() is not None)
+            return (i + 1,)
+
+        dr.while_loop((mi.UInt32(0, 1),), lambda i: i < 3, body, mode="symbolic")
+        assert alive and all(alive)
+        gc.collect()
+        assert facts() is None
 
 
 def in_threads(work: Any, count: int = 3) -> None:

@@ -129,23 +129,24 @@ def test_what_light_paths_cannot_render_is_refused_in_one_line(case: str, plugin
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-SPECTRA = f"""
+SPECTRA = """
+import sys
 from pathreplay.platform.backend import set_variant
-set_variant("{SPECTRAL}")
+set_variant(sys.argv[1])
 import mitsuba as mi
-band = {{"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}}
-film = {{"type": "specfilm", "width": 4, "height": 4, "band": band}}
-eye = {{"type": "perspective", "fov": 40, "film": film, "id": "eye"}}
-scene = mi.load_dict({{"type": "scene", "eye": eye, "lamp": {{"type": "point"}}}})
+band = {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}
+film = {"type": "specfilm", "width": 4, "height": 4, "band": band}
+eye = {"type": "perspective", "fov": 40, "film": film, "id": "eye"}
+scene = mi.load_dict({"type": "scene", "eye": eye, "lamp": {"type": "point"}})
 try:
-    mi.load_dict({{"type": "pathreplay_particles"}}).render(scene, spp=1)
+    mi.load_dict({"type": "pathreplay_particles"}).render(scene, spp=1)
 except Exception as error:
     print(type(error).__name__, error)
 """
 
 
 def test_films_of_spectra_are_refused_in_one_line(run_python: Callable[..., Any]) -> None:
-    done = run_python(SPECTRA)
+    done = run_python(SPECTRA, args=(SPECTRAL,))
     expected = "PathreplayError light paths cannot be added to the film of sensor 'eye': a SpecFilm stores spectra"
     assert done.returncode == 0 and done.stdout.strip().splitlines()[-1].startswith(expected), done
 

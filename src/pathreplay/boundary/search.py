@@ -44,7 +44,10 @@ class EdgeSearch(ABC, Generic[Segments]):
     bisection: ClassVar[Stream]  # random stream for the choice among the crossings of one segment
 
     def find(self, n: int, resolved: int, seed: mi.UInt32) -> Edges:
-        """Probe ``n`` segments, resample ``resolved`` of them by importance, and return their edges, detached."""
+        """Probe ``n`` segments, resample ``resolved`` of them by importance, and return their edges, detached.
+
+        A secondary search probes all segments of ``n`` paths instead.
+        """
         search = self.guided(n, seed)
         importance = search.detect(search.draw(dr.arange(mi.UInt32, n), n, seed))
         chosen = Resampled.of(importance, resolved, seed)

@@ -31,14 +31,15 @@ from pathreplay.boundary.occlusion import ArcSegment
 from pathreplay.boundary.search import EdgeSearch, SegmentDensity, pilot_size
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
+from pathreplay.transport.scatter import may_keep_directions
 from pathreplay.transport.vertex import TraceConfig
 
 UNGUIDED = 0.8
 """Fraction of pilot segments that are not concentrated at cast shadows, because shadows seen in reflections and
 refractions lie at other film positions."""
 ARCS = 4
-"""Number of arcs around a vertex with a narrow lobe. Other vertices have one arc, because the shadows that they see are
-found in the squares of emitters."""
+"""Number of arcs around a vertex with a narrow lobe. Other vertices have one arc: more arcs would take time, and would
+hardly reduce the noise."""
 
 
 @dataclass
@@ -101,7 +102,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         same path.
         """
         number = i // n
-        i -= number * n
+        i = i - number * n
         s, density = self.density.draw(*quasi_random(i, n, seed))
         return CameraPath(s, density, key_of(i, Stream.SECONDARY_KEYS.of(seed)), number)
 
@@ -120,7 +121,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         on_arc = segments.number > 0
         shadow = self._square(observer, segments.key).resolve(dr.select(on_arc, 0, weight), generator)
         arc = self._arc(observer, segments.key, segments.number)
-        sides = arc.resolve(dr.select(on_arc, weight / self._arcs(observer), 0), generator)
+        sides = arc.resolve(dr.select(on_arc, weight / self._arc_count(observer), 0), generator)
         path = EdgePath(segments.s, segments.key, dr.select(x.active, x.k, 0), x.at.ray, layout, records)
         return Edges(path, [*sides, shadow], observer)
 
@@ -135,9 +136,9 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     @property
     def most_arcs(self) -> int:
         """Largest number of arcs around a vertex."""
-        return ARCS if self.trace.traits.narrow else 1
+        return ARCS if may_keep_directions(self.trace) else 1
 
-    def _arcs(self, observer: ObserverVertex) -> mi.UInt32:
+    def _arc_count(self, observer: ObserverVertex) -> mi.UInt32:
         """Return the number of arcs around a vertex."""
         return dr.select(observer.keeps_direction, mi.UInt32(self.most_arcs), 1)
 
@@ -154,20 +155,26 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     def _importances(self, path: CameraPath) -> list[Importance]:
         """Estimate the importance of the segments in emitter squares, and of the arcs."""
         _, x = self._vertex(path, None, None)
-        none = dr.zeros(mi.Float, dr.width(path.key))
-        path.density += none  # broadcast to the number of paths
         observer, n = ObserverVertex(self.trace, x), dr.width(path.key)
-        square = self._square(observer, path.key).detect()
-        square = replace(square, presence=square.presence / path.density, edges=square.edges + none)
-        arcs = Importance(*(dr.zeros(mi.Float, n * self.most_arcs) for _ in fields(Importance)))
-        self._detect_arcs(observer, path, n, arcs)
-        dr.eval(path.s, path.density, square, arcs)
-        return [square, arcs]
+        none = dr.zeros(mi.Float, n)
+        path.density += none  # broadcast to the number of paths
+        importances = [self._square(observer, path.key).detect()]
+        if self.most_arcs == 1:
+            importances.append(self._arc(observer, path.key, mi.UInt32(1)).detect())
+        importances = [replace(w, presence=w.presence / path.density, edges=w.edges + none) for w in importances]
+        if self.most_arcs > 1:
+            importances.append(Importance(*(dr.zeros(mi.Float, n * self.most_arcs) for _ in fields(Importance))))
+            self._detect_arcs(observer, path, n, importances[1])
+        dr.eval(path.s, path.density, importances)
+        return importances
 
     @dr.syntax
     def _detect_arcs(self, observer: ObserverVertex, path: CameraPath, n: int, found: Importance) -> None:
-        """Write the importance of all arcs of ``n`` paths to ``found``, in the order of `draw`."""
-        search, arcs, number = self, self._arcs(observer), dr.full(mi.UInt32, 0, n)
+        """Write the importance of all arcs of ``n`` paths to ``found``, in the order of `draw`.
+
+        It is divided by the number of arcs around the vertex.
+        """
+        search, arcs, number = self, self._arc_count(observer), dr.zeros(mi.UInt32, n)
         while dr.hint(number < arcs, exclude=[search, observer, path, found], label="pathreplay: arcs"):
             arc = search._arc(observer, path.key, number + 1).detect()
             i = number * n + dr.arange(mi.UInt32, n)

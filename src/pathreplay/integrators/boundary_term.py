@@ -28,8 +28,8 @@ from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
 FILM_CLOSER, INNER_CLOSER, NARROW_CLOSER = 5, 16, 8
-"""Number of paths per bisected segment: in searches on the film, in secondary searches, and in secondary searches in
-scenes with narrow lobes, where paths have more arcs."""
+"""Number of segments on the film, and of paths in secondary searches, per bisected segment. If vertices have several
+arcs, `NARROW_CLOSER` replaces `INNER_CLOSER`."""
 GRID = "SDFGrid"
 """Class of shapes whose silhouettes cannot be sampled. Rays miss them near the outline, and points on them cannot be
 kept at fixed surface coordinates."""
@@ -125,8 +125,8 @@ class Boundary(Term):
             if trace.media is not None and trace.traits.hard_lights:
                 yield VolumetricSearch.of(trace, places, length).find(n, on_film, seed)
         if self.inner:
-            inner = n // (NARROW_CLOSER if trace.traits.narrow else INNER_CLOSER)
-            yield SecondarySearch.of(trace, places, INNER_LENGTHS).find(n, max(inner, 1), seed)
+            search = SecondarySearch.of(trace, places, INNER_LENGTHS)
+            yield search.find(n, max(n // (NARROW_CLOSER if search.most_arcs > 1 else INNER_CLOSER), 1), seed)
 
 
 def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:

@@ -8,11 +8,12 @@ including the objects of other scenes. Four rules follow, which this module enfo
    the scene, once nothing else references the scene. (`nodes` ensures that traversals leave no reference cycles.)
 2. No object is created or freed between two virtual function calls of one kernel. Otherwise Dr.Jit emits the same
    function twice ("invalid redefinition"). The cyclic garbage collector is therefore off during a pass, and scenes are
-   released before the pass.
+   released before the pass. They are not released either while other integrators trace.
 3. No scene is freed while `dr.freeze` records. Freeing a scene launches a host function, which cannot be recorded and
    crashes the process. No scene is therefore released during a recording, and objects that may have become garbage are
-   hidden from the collector until the recording has ended. Before and after a recording, `dr.freeze` traverses the
-   registry twice and raises an error if the number of objects has changed. No scene is released in between either.
+   hidden from the collector until the recording has ended. `dr.freeze` also traverses the registry outside of the
+   recording, and raises an error if the number of objects has changed in the meantime. No scene is therefore released
+   during the whole call of a frozen function.
 4. Only one Python thread renders at a time. All threads of a process share Dr.Jit's registry and memory. Threads that
    trace or launch kernels concurrently get wrong results or crash the process. A pass therefore raises an error if
    another thread has a pass in progress; `exclusive` lets threads take turns.
@@ -80,6 +81,9 @@ _ONE_THREAD = threading.RLock()
 _AT_COLLECTION = threading.Lock()
 """Locked while `_on_collection` may hold `_ONE_THREAD`. A pass then waits briefly instead of raising an error."""
 _passes = 0  # number of nested passes in progress
+_last_thread = (
+    0  # thread of the last pass; a collection in another thread releases no scene, because this one may trace
+)
 _hidden = False  # whether objects are hidden from the collector
 
 
@@ -109,7 +113,7 @@ def careful() -> Iterator[None]:
 
     Raises PathreplayError if another thread is in a pass or in an `exclusive` block.
     """
-    global _passes
+    global _passes, _last_thread
     if not _acquire():
         raise PathreplayError(
             "pathreplay: another Python thread is rendering, and Dr.Jit computes wrong results if two use it at once: "
@@ -121,6 +125,7 @@ def careful() -> Iterator[None]:
             SCENES.release()
         gc.disable()
         _passes += 1
+        _last_thread = threading.get_ident()
         try:
             with plain_errors():
                 yield
@@ -180,7 +185,7 @@ def _on_collection(phase: str, info: dict[str, int]) -> None:
             if phase == "start" and _hidden:
                 gc.unfreeze()
                 _hidden = False
-            elif phase == "stop" and not _within_drjit():
+            elif phase == "stop" and threading.get_ident() == _last_thread and not _within_drjit():
                 SCENES.release()
         finally:
             _ONE_THREAD.release()
@@ -189,9 +194,9 @@ def _on_collection(phase: str, info: dict[str, int]) -> None:
 
 
 def _within_drjit() -> bool:
-    """Return whether this thread is in Dr.Jit's or Mitsuba's Python code, or traces a loop or a virtual function call.
+    """Return whether this thread is in Python code of Dr.Jit or Mitsuba, or traces a loop or a virtual function call.
 
-    Objects may then be in use that no Python variable refers to, by other integrators or by a frozen function.
+    Other integrators or a frozen function may then use objects that no Python variable references.
     """
     if dr.flag(dr.JitFlag.SymbolicScope):
         return True

@@ -35,7 +35,7 @@ class Stream(IntEnum):
     PARTS = 0x6F4C21B0  # parts of a pass; `mi.render` hashes 1 and the seed of an image to the seed of its gradient
     # The key of the stream is the key of the path ^ the value.
     EMITTER_SEGMENTS = 0x1B873593
-    ARCS = 0x38B34AE5
+    ARCS = 0x38B34AE5  # with several arcs around a vertex: a hash of this key and the number of the arc
     # The value is the first index of the stream in the sequence of a key.
     ARC = 0x100
     BEYOND_EDGE = 0x20000  # radiance that arrives from behind an edge

@@ -188,10 +188,15 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
     boundary term. The result is therefore False in all lanes unless boundary terms are estimated. The criterion depends
     on vertex and incident ray only, so that one rule applies to all directions sampled at a vertex.
     """
-    if not (trace.may_slide and trace.traits.glossy):
+    if not may_keep_directions(trace):
         return mi.Bool(False)
     centre, _ = si.bsdf().sample(mi.BSDFContext(), dr.detach(si), 0.5, mi.Point2f(0.5), active)
     return active & ~mi.has_flag(centre.sampled_type, mi.BSDFFlags.Delta) & (dr.detach(centre.pdf) > NARROW)
+
+
+def may_keep_directions(trace: TraceConfig) -> bool:
+    """Return whether the result of `keeps_direction` may be True."""
+    return trace.may_slide and trace.traits.glossy
 
 
 def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:

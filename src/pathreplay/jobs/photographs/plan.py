@@ -10,8 +10,8 @@ VIEWS = 8
 SAMPLES, MOST_SPP = 160_000, 4
 """Samples per iteration, with at most `MOST_SPP` per pixel: many noisy steps go further than a few exact ones."""
 CHEAP, MOST_CHEAP_SPP = 0.25, 64
-"""On a fast machine more samples are rendered, with at most `MOST_CHEAP_SPP` per pixel: as many as take `CHEAP` times
-as long as the part of an iteration that does not depend on the number of samples."""
+"""On a fast machine more samples are rendered, with at most `MOST_CHEAP_SPP` per pixel: as many per view as take
+`CHEAP` times `A_VIEW`."""
 SHARES = {8: 0.1, 4: 0.2, 2: 0.3, 1: 0.4}
 """Fraction of the time for each stage, by the factor by which images are reduced."""
 RESOLUTION = 0.75
@@ -89,8 +89,9 @@ def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: 
         for k, (factor, share) in enumerate(shares.items()):
             pixels = (width // factor) * (height // factor)
             views = min(VIEWS if factor > 1 else VIEWS // 2, trained)
-            cheap = CHEAP * A_VIEW * speed.samples / PASSES  # samples per view
-            spp = max(1, min(round(SAMPLES / (views * pixels)), MOST_SPP), min(int(cheap / pixels), MOST_CHEAP_SPP))
+            wanted = min(round(SAMPLES / (views * pixels)), MOST_SPP)
+            cheap = min(int(CHEAP * A_VIEW * speed.samples / (PASSES * pixels)), MOST_CHEAP_SPP)
+            spp = max(1, wanted, cheap)
             step = views * (A_VIEW + spp * PASSES * pixels / speed.samples)
             size = min(max(round(RESOLUTION * max(width, height) / factor), COARSEST), FINEST)
             step += VALUES * size**3 * (A_VALUE + views * A_VALUE_OF_VIEW)

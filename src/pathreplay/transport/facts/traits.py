@@ -148,13 +148,19 @@ def tables_of(
 
 
 def _array(kind: type[A], values: ArrayLike) -> A:
-    """Create an array of these values.
+    """Create an array of these values, in memory that Dr.Jit has allocated.
+
+    The alignment of NumPy arrays varies, which would make frozen functions record again.
 
     While `dr.freeze` records, arrays must not be created from host memory. Recorded scatter operations then fill the
     array, with one operation for each run of equal values.
     """
     if not dr.flag(dr.JitFlag.FreezingScope):
-        return kind(values)
+        shared = kind(values)
+        array = dr.zeros(kind, dr.width(shared))
+        dr.scatter(array, shared, dr.arange(mi.UInt32, dr.width(shared)))
+        dr.eval(array)
+        return array
     values = np.asarray(values)
     begins = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1), len(values)]
     if len(begins) > MOST_RUNS:
