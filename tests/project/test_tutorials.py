@@ -59,8 +59,8 @@ def test_there_are_five_and_each_is_valid() -> None:
     [("gradient_based_opt", "red.reflectance.value"), ("forward_inverse_rendering", "green.reflectance.value")],
 )
 def test_a_colour_is_found(name: str, key: str, tmp_path: Path) -> None:
-    """With a learning rate for fewer steps; at full length the error is below 0.01."""
-    job = small(name, iterations=60, learning_rate=0.12, final_learning_rate_ratio=0.1, spp=16)
+    """At 16 x 16 pixels and 16 samples, 60 steps leave an error of up to a fifth of the first one: it is noise."""
+    job = small(name, iterations=120, learning_rate=0.12, final_learning_rate_ratio=0.1, spp=16)
     result = optimize(make_config(job), output=tmp_path / "run", progress=False)
     assert result.errors[key] < 0.2 * result.history[0].errors[key]
 
