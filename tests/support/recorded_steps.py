@@ -14,5 +14,6 @@ def steps(problem, config, passes: str) -> np.ndarray:
         take_step(problem, run, i)
     # The first step is traced in any case; the others launch what the second recorded, view by view.
     frozen = run.executor.evaluate._recordings[config.spp]._frozen.values()
-    assert [each.n_recordings for each in frozen] == [1] * len(problem.views) * (passes == "recorded")
+    recordings = [each.n_recordings for each in frozen]
+    assert recordings == [1] * len(problem.views) * (passes == "recorded"), recordings
     return np.array([[entry.loss, *entry.gradient_norms.values()] for entry in run.history])
