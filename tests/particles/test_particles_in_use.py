@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from pathreplay.jobs import optimize
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
 from recorded_steps import steps
-from variant import SPECTRAL
+from variant import BACKEND, SPECTRAL
 
 PARTICLES = {"type": "pathreplay_particles", "max_depth": 3, "boundary": "none"}
 CAUSTICS = {"type": "pathreplay", "max_depth": 4, "boundary": "none", "caustics": "particles"}
@@ -181,8 +180,9 @@ def test_derivatives_of_unbounded_paths_are_refused(plugin: dict) -> None:
     assert mi.load_dict(unbounded).render(scene, spp=1).shape == (HEIGHT, WIDTH, 3)
     with pytest.raises(PathreplayError) as caught:
         gradient(scene, unbounded, "floor.bsdf.reflectance.value")
-    message = r"max_depth = -1 \(unbounded\) is more than the record of a light path can hold: take up to \d+ where .*"
-    assert re.fullmatch(message, str(caught.value))
+    message = "max_depth = -1 (unbounded) is more than the record of a light path can hold: take up to "
+    most = "2049 where" if BACKEND == "llvm" else ""  # on a GPU it depends on the memory of the device
+    assert str(caught.value).startswith(message + most) and "\n" not in str(caught.value)
 
 
 # ------------------------------ Which parameters reach them ------------------------------

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.owned_arrays import owned
 from pathreplay.transport.vertex import VertexRecord
 from pathreplay.transport.volume.media import interaction, majorant, span
 
@@ -185,9 +186,7 @@ class BaselineState:
                 f"the learned baseline of the media has the shapes {shapes} instead of {wanted}, "
                 "or a branching weight outside (0, 1]: start a new run"
             )
-        # Copy into memory that Dr.Jit has allocated: recorded passes require the alignment of such memory.
-        one = dr.opaque(mi.Float, 1)
-        sums, branching = (mi.Float(np.array(learned[name], np.float32)) * one for name in ("sums", "branching"))
+        sums, branching = (owned(mi.Float(np.array(learned[name], np.float32))) for name in ("sums", "branching"))
         return BaselineState(BaselineCells.of(box), sums, branching)
 
 

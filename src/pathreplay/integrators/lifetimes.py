@@ -81,9 +81,7 @@ _ONE_THREAD = threading.RLock()
 _AT_COLLECTION = threading.Lock()
 """Locked while `_on_collection` may hold `_ONE_THREAD`. A pass then waits briefly instead of raising an error."""
 _passes = 0  # number of nested passes in progress
-_last_thread = (
-    0  # thread of the last pass; a collection in another thread releases no scene, because this one may trace
-)
+_last_thread = 0  # thread of the last pass. It may be tracing, so collections in other threads release no scene.
 _hidden = False  # whether objects are hidden from the collector
 
 

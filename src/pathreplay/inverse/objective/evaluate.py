@@ -39,6 +39,7 @@ from pathreplay.inverse.parameters.response import gradient as response_gradient
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem, scene_values, sensor_of
 from pathreplay.platform import memory
+from pathreplay.platform.owned_arrays import owned
 from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
@@ -187,11 +188,8 @@ def release(values: Arrays) -> None:
 
 
 def owned_tensor(picture: Array) -> mi.TensorXf:
-    """Copy an image into memory that Dr.Jit owns.
-
-    The alignment of NumPy arrays varies, which would make frozen functions record again.
-    """
-    tensor = mi.TensorXf(np.ascontiguousarray(picture)) * dr.opaque(mi.Float, 1)
+    """Copy an image into memory that Dr.Jit owns: see `owned`."""
+    tensor = owned(mi.TensorXf(np.ascontiguousarray(picture)))
     dr.eval(tensor)
     return tensor
 

@@ -57,6 +57,7 @@ from pathreplay.inverse.parameters.variables import Variable, free_of, keys_of, 
 from pathreplay.inverse.problem import feasibility
 from pathreplay.inverse.problem.completed import completed
 from pathreplay.platform import memory
+from pathreplay.platform.owned_arrays import owned
 from pathreplay.platform.threads import one_thread
 from pathreplay.platform.traversal import known_values, traversed
 from pathreplay.scenes import parameters
@@ -170,9 +171,7 @@ class Problem:
 
 def variables_of(problem: Problem, values: Arrays) -> dict[str, dr.ArrayBase]:
     """Convert the decoded values of the variables to evaluated Dr.Jit arrays that own their memory."""
-    # The product copies values to aligned memory. NumPy's varying alignments would make frozen functions record again.
-    one = dr.opaque(mi.Float, 1)
-    variables = {v.key: v.held(values[v.key]) * one for v in problem.variables}
+    variables = {v.key: owned(v.held(values[v.key])) for v in problem.variables}
     dr.eval(variables)
     return variables
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from pathreplay.errors import PathreplayError
 from pathreplay.platform import compat
+from pathreplay.platform.owned_arrays import owned
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of
 from pathreplay.transport.facts.seams import CHECKERBOARD
 from pathreplay.transport.facts.smoothing_groups import mesh_smoothing_groups
@@ -148,17 +149,13 @@ def tables_of(
 
 
 def _array(kind: type[A], values: ArrayLike) -> A:
-    """Create an array of these values, in memory that Dr.Jit has allocated.
-
-    The alignment of NumPy arrays varies, which would make frozen functions record again.
+    """Create an array of these values, in memory that Dr.Jit has allocated (see `owned`).
 
     While `dr.freeze` records, arrays must not be created from host memory. Recorded scatter operations then fill the
     array, with one operation for each run of equal values.
     """
     if not dr.flag(dr.JitFlag.FreezingScope):
-        shared = kind(values)
-        array = dr.zeros(kind, dr.width(shared))
-        dr.scatter(array, shared, dr.arange(mi.UInt32, dr.width(shared)))
+        array = owned(kind(values))
         dr.eval(array)
         return array
     values = np.asarray(values)
