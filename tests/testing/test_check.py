@@ -451,6 +451,16 @@ def test_a_loss_is_linearised(box: Any) -> None:
         check_gradient(box, "white.reflectance.value", integrator="prb", loss=lambda image: mi.Float(1), seeds=2, spp=1)
 
 
+def test_attached_parameters_of_another_scene_do_not_matter(box: Any) -> None:
+    other = mi.traverse(mi.load_dict(mi.cornell_box(), optimize=False))
+    dr.enable_grad(other["red.reflectance.value"])
+    other.update()
+    result = check_gradient(
+        box, "red.reflectance.value", integrator="prb", loss=lambda image: dr.mean(image, axis=None), seeds=8, spp=64
+    )
+    assert result.verdict == "pass", str(result)
+
+
 # ------------------------------------------------------------------------------
 #  Manners
 # ------------------------------------------------------------------------------

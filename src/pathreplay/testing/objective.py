@@ -167,7 +167,9 @@ class Objective:
         return t
 
     def _render(self, integrator: mi.Integrator, seed: int, spp: int) -> mi.TensorXf:
-        with errors_as(f"Integrator '{integrator_name(integrator)}' cannot render the scene"):
+        # Virtual function calls reach the objects of all scenes in the process. Without suspend_grad(), attached
+        # parameters of another scene would attach this image.
+        with errors_as(f"Integrator '{integrator_name(integrator)}' cannot render the scene"), dr.suspend_grad():
             return mi.TensorXf(integrator.render(self.scene, self.sensor, seed=mi.UInt32(seed), spp=spp))
 
 
