@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 
 import drjit as dr
@@ -415,7 +414,6 @@ def test_nothing_moves_when_only_a_smooth_lobe_changes() -> None:
     from pathreplay.transport.motion import path_moves
     from pathreplay.transport.start import CameraStart
 
-    gc.collect()  # shapes of earlier scenes would be asked, too
     description = lit_room({"type": "roughconductor", "alpha": 0.2})
     description["mirror"] = {"type": "sphere", "center": [0, 0, -5], "bsdf": {"type": "conductor"}}
     scene = mi.load_dict(description, optimize=False)

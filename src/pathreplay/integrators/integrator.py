@@ -297,7 +297,7 @@ class PathReplayIntegrator(PathIntegrator):
         """Render and back-propagate as `render_value_and_grad` does; ``derivative`` is the pair (offset, slope)."""
         offset, slope = derivative
         some = None if pixels is None else mi.UInt32(pixels)
-        with reached(view.scene, view.sensor, zero_is_error=True), self._pass_context(), dr.isolate_grad():
+        with reached(view, zero_is_error=True), self._pass_context(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope, some)
             view, trace, (_, *edges) = self._planned(view, state, follow=False)
             if view.flow is not None:

@@ -38,6 +38,14 @@ from pathreplay.errors import PathreplayError
 
 T = TypeVar("T")
 
+_OUTSIDE = "outside of the current dr.isolate_grad() scope"
+"""Part of Dr.Jit's message about edges of its AD graph that a pass must not traverse."""
+_UNPROPAGATED = (
+    "forward mode: tangents have not been propagated to all parameters that this pass traces: call "
+    "dr.forward(x, dr.ADFlag.ClearEdges) before it if the parameters are computed from a variable x, and detach the "
+    "parameters of other scenes that are alive (params[key] = dr.detach(params[key]), then params.update())"
+)
+
 
 @dataclass
 class _Entry(Generic[T]):
@@ -149,16 +157,21 @@ def _acquire() -> bool:
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Context that raises a PathreplayError itself instead of the exception in which Dr.Jit wraps it after a loop."""
+    """Context that replaces exceptions of Dr.Jit, which wraps exceptions raised inside of a loop, by their cause.
+
+    The cause is a PathreplayError, or forward propagation along edges that are outside of the pass.
+    """
     try:
         yield
     except RuntimeError as error:
         cause: BaseException | None = error
-        while cause is not None and not isinstance(cause, PathreplayError):
+        while cause is not None:
+            if isinstance(cause, PathreplayError):
+                raise cause from None
+            if _OUTSIDE in str(cause):
+                raise PathreplayError(_UNPROPAGATED) from error
             cause = cause.__cause__
-        if cause is None:
-            raise
-        raise cause from None
+        raise
 
 
 def _hide_garbage() -> None:

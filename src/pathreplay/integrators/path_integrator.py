@@ -25,6 +25,7 @@ from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import Unlearned
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.registration import mitsuba_integrator
+from pathreplay.transport.facts.nodes import may_have_gradients, nodes_of
 from pathreplay.transport.facts.traits import Tables
 from pathreplay.transport.motion import path_moves, weights_vary
 from pathreplay.transport.path import PathState
@@ -44,16 +45,19 @@ def _sum(total: mi.TensorXf | None, image: mi.TensorXf, share: float) -> mi.Tens
 
 
 @contextmanager
-def reached(scene: mi.Scene, sensor: Which, zero_is_error: bool = False) -> Iterator[None]:
+def reached(view: Pass, zero_is_error: bool = False) -> Iterator[None]:
     """Context of a gradient pass: explain `Unreached` errors, and suppress them if the gradient is zero by design.
 
     The gradient is zero by design if only other cameras have gradients (see `unreached_note`). With ``zero_is_error``,
-    the error is also raised if the gradient is zero by design.
+    the error is also raised if the gradient is zero by design. Attached parameters of another scene can hide the error
+    from the pass. It is therefore raised after the pass if no object of this scene has gradients.
     """
     try:
         yield
+        if not any(map(may_have_gradients, nodes_of(view.scene) | nodes_of(view.sensor) | {view.sensor})):
+            raise Unreached("no parameter of the scene has gradients")
     except Unreached as error:
-        note = unreached_note(scene, Pass.of(scene, sensor, 0, 1).sensor)
+        note = unreached_note(view.scene, view.sensor)
         if note or zero_is_error:
             raise Unreached(note or str(error)) from error
 
@@ -170,7 +174,7 @@ class PathIntegrator(Unlearned):
     def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState:
         """Back-propagate an image gradient into the parameters: see `render_backward`."""
         passes = parts(view)
-        with reached(view.scene, view.sensor), summed(view.scene, passes) as add_up:
+        with reached(view), summed(view.scene, passes) as add_up:
             for part in passes:
                 # Isolation preserves the AD graph from the parameters to derived scene values for the next pass.
                 with self._pass_context(), dr.isolate_grad():

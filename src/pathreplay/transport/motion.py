@@ -1,8 +1,13 @@
-"""Find which parts of a path depend on differentiated parameters. Kernels omit the derivatives of all other parts."""
+"""Find which parts of a path depend on differentiated parameters. Kernels omit the derivatives of all other parts.
+
+The functions of this file record one step of a path and ask Dr.Jit which results have gradients. Virtual function calls
+reach the objects of all scenes in the process. Results may therefore have gradients because of another scene. They
+count only if objects of the traced scene have gradients, too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +16,7 @@ from pathreplay.platform import compat
 from pathreplay.platform.traversal import known_values
 from pathreplay.transport import scatter
 from pathreplay.transport.arrive import Vertex
-from pathreplay.transport.facts.nodes import nodes_of, with_gradients
+from pathreplay.transport.facts.nodes import may_have_gradients, nodes_of, with_gradients
 from pathreplay.transport.start import Start
 from pathreplay.transport.vertex import Arrival, SampledContinuation, TraceConfig, VertexRecord, VertexSamples
 
@@ -79,18 +84,27 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
         return False
     with dr.resume_grad():
         si = at.hit.compute_surface_interaction(at.ray, compat.shading())
-        moving: list[dr.ArrayBase] = [*start.repeat(), si.p, si.n, si.sh_frame.n]
+        surface: list[dr.ArrayBase] = [si.p, si.n, si.sh_frame.n]
         if painted:
-            moving += [si.uv, si.dp_du, si.dp_dv]
+            surface += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
         # For `edges_move`, ``painted`` is False, and smooth lobes that are sampled attached are ignored. Boundary terms
         # need attach = 'delta'. Smooth lobes are then sampled attached only in scenes without outlines.
-        for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ()):
-            sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5), mi.Bool(True))
-            moving.append(sample.wo)
+        mirrored = [
+            bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5), mi.Bool(True))[0].wo
+            for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ())
+        ]
         light, _ = trace.scene.sample_emitter_direction(still, mi.Point2f(0.5), False)
-        moving += [light.p, light.d, light.pdf]
-        return any(dr.grad_enabled(value) for value in moving)
+        return (
+            dr.grad_enabled(*start.repeat(), *mirrored)
+            or (dr.grad_enabled(*surface) and have_gradients(trace.scene, mi.Shape))
+            or (dr.grad_enabled(light.p, light.d, light.pdf) and have_gradients(trace.scene, mi.Shape, mi.Emitter))
+        )
+
+
+def have_gradients(scene: mi.Scene, *kinds: type[mi.Object]) -> bool:
+    """Return whether objects of these types in the scene may have gradients (see `may_have_gradients`)."""
+    return any(map(may_have_gradients, (node for node in nodes_of(scene) if isinstance(node, kinds))))
 
 
 def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
@@ -106,4 +120,12 @@ def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
     u = VertexSamples(mi.Point2f(0.5), mi.Float(0.5), mi.Point2f(0.5), mi.Float(0.5))
     again = VertexRecord(at, u, kept, valid, at.hit, mi.Float(1), mi.Spectrum(1))
     with dr.resume_grad():
-        return dr.grad_enabled(scatter.repeat(trace, v, again, mi.BSDFContext(), False)[0])
+        weight = scatter.repeat(trace, v, again, mi.BSDFContext(), False)[0]
+        return dr.grad_enabled(weight) and any(map(may_have_gradients, _surface_nodes(trace.scene)))
+
+
+def _surface_nodes(scene: mi.Scene) -> Iterable[mi.Object]:
+    """Return the shapes and BSDFs of a scene, with the textures of the BSDFs."""
+    nodes = nodes_of(scene)
+    bsdfs = {node for node in nodes if isinstance(node, mi.BSDF)}
+    return bsdfs.union(*map(nodes_of, bsdfs), (node for node in nodes if isinstance(node, mi.Shape)))

@@ -42,7 +42,7 @@ from pathreplay.integrators.film.grid import Cell, NodeSums, interpolated, is_ne
 from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.meet import meet
-from pathreplay.transport.motion import may_move
+from pathreplay.transport.motion import have_gradients, may_move
 from pathreplay.transport.vertex import TraceConfig
 
 K_0 = 1e3
@@ -71,7 +71,7 @@ class SurfaceFlow:
         with dr.resume_grad():
             flags = compat.minimal() | compat.follow_shape()
             si = hit.compute_surface_interaction(ray, flags, visible)
-            if not dr.grad_enabled(si.p):
+            if not (dr.grad_enabled(si.p) and have_gradients(trace.scene, mi.Shape)):
                 return None
             derivatives = ray_derivatives(sensor, sample)
             cos, wide = dr.dot(dr.detach(si.n), ray.d), dr.squared_norm(derivatives[0][0] + t * derivatives[1][0])

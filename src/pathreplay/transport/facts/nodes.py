@@ -81,6 +81,21 @@ def plain_numbers(node: mi.Object) -> tuple[object, ...]:
     return tuple(plain)
 
 
+def may_have_gradients(node: mi.Object) -> bool:
+    """Return whether a parameter of a node itself, not of its descendants, has gradients.
+
+    The result is also True for all objects of Python classes, because such objects may have gradients in members that
+    `mi.traverse` does not show.
+    """
+    if hasattr(node, "__dict__"):
+        return True
+    with dr.resume_grad():
+        return any(
+            dr.grad_enabled(value if cpptype is None else mi.get_property(value, cpptype, node))
+            for _, value, cpptype in _contents(node)[1]
+        )
+
+
 def with_gradients(root: mi.Object, *names: str) -> list[Any]:
     """Find the parameters of an object and its descendants that have gradients.
 
