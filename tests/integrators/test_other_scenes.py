@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from pathreplay import PathreplayError
@@ -19,6 +20,7 @@ from truth import lit_room, rgb, translate
 
 COLOUR, PLACE = "object.bsdf.reflectance.value", "object.to_world"
 LAMP, SKY = "lamp.intensity.value", "sky.radiance.value"
+OF_OTHER = COLOUR, PLACE, LAMP, "lamp.position"
 
 
 def room() -> mi.Scene:
@@ -34,14 +36,17 @@ def attach(scene: mi.Scene, *keys: str) -> mi.SceneParameters:
     return params
 
 
-@pytest.fixture(autouse=True)
-def other() -> Iterator[mi.Scene]:
-    """Another scene, in which everything moves."""
-    scene = room()
-    params = attach(scene, COLOUR, PLACE, LAMP, "lamp.position")
-    yield scene
-    dr.disable_grad(*(params[key] for key in (COLOUR, PLACE, LAMP, "lamp.position")))
+def detach(params: mi.SceneParameters) -> None:
+    dr.disable_grad(*(params[key] for key in OF_OTHER))
     params.update()
+
+
+@pytest.fixture(autouse=True)
+def other() -> Iterator[mi.SceneParameters]:
+    """The parameters of another scene, in which everything moves."""
+    params = attach(room(), *OF_OTHER)
+    yield params
+    detach(params)
 
 
 @pytest.mark.parametrize(
@@ -77,6 +82,19 @@ def test_the_film_flows_with_surfaces_of_the_scene_alone(key: str, flows: bool) 
     with careful(), dr.suspend_grad():
         part, _, _ = integrator._planned(Pass.of(scene, 0, 1, 4), integrator.begin(scene))
     assert (part.flow is not None) == flows
+
+
+@pytest.mark.parametrize("key", [COLOUR, "lamp.position"])
+def test_gradients_are_the_same(key: str, other: mi.SceneParameters) -> None:
+    scene, integrator, found = room(), mi.load_dict({"type": "pathreplay", "max_depth": 3}), []
+    for change in (lambda params: None, detach):
+        change(other)
+        params = attach(scene, key)
+        integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (16, 16, 3)), seed=1, spp=16)
+        found.append(np.array(dr.grad(params[key])))
+        dr.disable_grad(params[key])
+    assert np.abs(found[0]).max() > 0
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
 
 
 @pytest.mark.parametrize("plugin", ["pathreplay", "pathreplay_particles"])

@@ -44,6 +44,11 @@ def _contents(node: mi.Object) -> tuple[list[tuple[str, mi.Object]], list[tuple[
     return callback.children, callback.values
 
 
+def _current(node: mi.Object, value: object, cpptype: type | None) -> Any:
+    """Return the current value of a parameter of a node, from its value and type in `_contents`."""
+    return value if cpptype is None else mi.get_property(value, cpptype, node)
+
+
 def is_mesh(shape: mi.Shape) -> TypeIs[mi.Mesh]:
     """Check whether a shape is a mesh, and narrow its type."""
     return shape.is_mesh()
@@ -71,7 +76,7 @@ def plain_numbers(node: mi.Object) -> tuple[object, ...]:
     plain: list[object] = []
     hides = isinstance(node, mi.PhaseFunction)
     for name, value, cpptype in _contents(node)[1]:
-        value = value if cpptype is None else mi.get_property(value, cpptype, node)
+        value = _current(node, value, cpptype)
         if isinstance(value, (bool, int, float)) and name != "sampling_weight":
             plain.append(value)
         elif isinstance(value, (mi.ScalarTransform3f, mi.ScalarTransform4f)):
@@ -90,10 +95,7 @@ def may_have_gradients(node: mi.Object) -> bool:
     if hasattr(node, "__dict__"):
         return True
     with dr.resume_grad():
-        return any(
-            dr.grad_enabled(value if cpptype is None else mi.get_property(value, cpptype, node))
-            for _, value, cpptype in _contents(node)[1]
-        )
+        return any(dr.grad_enabled(_current(node, value, cpptype)) for _, value, cpptype in _contents(node)[1])
 
 
 def with_gradients(root: mi.Object, *names: str) -> list[Any]:
@@ -109,7 +111,7 @@ def with_gradients(root: mi.Object, *names: str) -> list[Any]:
         children, values = _contents(node)
         for name, value, cpptype in values:
             if not names or any(f"{prefix}{name}.".startswith(f"{n}.") for n in names):
-                value = value if cpptype is None else mi.get_property(value, cpptype, node)
+                value = _current(node, value, cpptype)
                 if value is not None:  # hair with ``eumelanin`` has no ``sigma_a``
                     parameters.append(value)
         for name, child in children:
