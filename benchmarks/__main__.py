@@ -31,6 +31,7 @@ from .tasks import (
     noise,
     particles,
     quality,
+    roughness,
     scale,
     startup,
     supergrid,
@@ -42,6 +43,7 @@ from .tasks import (
 _TASKS = (
     startup,
     surface,
+    roughness,
     iteration,
     attached,
     edges,

@@ -1,8 +1,9 @@
-"""The measured scenes without media: Cornell boxes, a sealed box, and metal balls under an environment."""
+"""The measured scenes without media: Cornell boxes, a sealed box, and metal balls in several kinds of light."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import mitsuba as mi
 import numpy as np
@@ -56,6 +57,35 @@ def glossy_environment(resolution: int) -> SceneDict:
     return scene
 
 
+def metal_ball(light: str, alpha: float, resolution: int) -> SceneDict:
+    """A ball of rough metal on a floor, under a ``sky`` or a ``lamp``, or in a Cornell box (``room``).
+
+    Key: ``ball.bsdf.alpha.value``.
+    """
+    T = mi.ScalarTransform4f
+    metal = {"type": "roughconductor", "material": "Al", "distribution": "ggx", "alpha": alpha}
+    if light == "room":
+        scene = glass_and_diffuse(resolution)
+        scene["ball"]["bsdf"] = metal
+        scene["sensor"]["film"] |= {"rfilter": {"type": "box"}}
+        return scene
+    lights: dict[str, SceneDict] = {
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky()), "to_world": T().rotate([1, 0, 0], 90)},
+        "lamp": {
+            "type": "rectangle",
+            "to_world": T().look_at(origin=[-2, -3, 4], target=[0, 0, 0.5], up=[0, 0, 1]).scale(0.7),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 10.0}},
+        },
+    }
+    return {
+        "type": "scene",
+        "sensor": sensor(resolution, [0, -3, 1.5], [0, 0, 0.4], fov=30),
+        "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": {"type": "diffuse"}},
+        "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5, "bsdf": metal},
+        light: lights[light],
+    }
+
+
 def sky() -> np.ndarray:
     """A bluish sky over a dark ground with a warm sun of about 15 degrees, 32 times as bright as the sky."""
     v, u = np.mgrid[0:64, 0:128].astype(np.float32)
@@ -105,6 +135,12 @@ def _boxed(make: Callable[[int], SceneDict]) -> Callable[[int], SceneDict]:
 
     return boxed
 
+
+ROUGHNESSES, LIGHTS = (0.05, 0.1, 0.3), ("sky", "lamp", "room")
+
+METAL_SCENES: dict[str, Callable[[int], SceneDict]] = {
+    f"{light}, {alpha:g}": partial(metal_ball, light, alpha) for light in LIGHTS for alpha in ROUGHNESSES
+}
 
 SURFACE_SCENES: dict[str, Callable[[int], SceneDict]] = {
     "cornell-box": cornell_box,
