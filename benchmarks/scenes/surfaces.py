@@ -65,9 +65,8 @@ def metal_ball(light: str, alpha: float, resolution: int) -> SceneDict:
     T = mi.ScalarTransform4f
     metal = {"type": "roughconductor", "material": "Al", "distribution": "ggx", "alpha": alpha}
     if light == "room":
-        scene = glass_and_diffuse(resolution)
+        scene = _boxed(glass_and_diffuse)(resolution)
         scene["ball"]["bsdf"] = metal
-        scene["sensor"]["film"] |= {"rfilter": {"type": "box"}}
         return scene
     lights: dict[str, SceneDict] = {
         "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky()), "to_world": T().rotate([1, 0, 0], 90)},
