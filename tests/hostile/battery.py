@@ -104,9 +104,6 @@ def run_cases(
 ) -> list[Result]:
     """Try all cases, several at once; ``told`` hears of each. None is begun after ``limit_s`` seconds.
 
-    A case may exceed its time limit only because of the load of the other cases. Such a case is tried again, alone, and
-    the second result counts.
-
     Raises:
         TimeoutError: there was not enough time for all.
     """
@@ -136,12 +133,6 @@ def run_cases(
             worker.start()
         for worker in workers:
             worker.join()
-        slow = [result for result in results if result.ended.killed == "timeout"]
-        if slow and not failures:
-            results = [result for result in results if result not in slow]
-            for result in slow:
-                waiting.put(result.case)
-            work(Lane(scratch / "alone", assets))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     if failures:

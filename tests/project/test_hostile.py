@@ -5,16 +5,14 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 import pytest
 
-from hostile import battery
 from hostile.assets import make_room
-from hostile.battery import Lane, Result, make_assets, run_cases, table
-from hostile.case import RECIPES, Action, Case
+from hostile.battery import Lane, make_assets, run_cases, table
+from hostile.case import RECIPES, Case
 from hostile.generate import COUNT, make_case
-from hostile.judge import Ended, Verdict, judge
+from hostile.judge import Ended, judge
 from hostile.pairs import KEYS, Cover, missing_keys
 from hostile.room import Room
 from hostile.snapshot import snapshot
@@ -82,35 +80,6 @@ def test_a_handful_is_refused(
     ended = Ended(int(end.value.code or 0), "", 0.0, 0, *capfd.readouterr())
     assert judge(recipe, action, ended, before, snapshot(tmp_path)).findings == (), ended.stderr
     assert ended.status == 2
-
-
-class _LoadedLane:
-    """A lane in which a case exceeds its time limit unless it is tried a second time."""
-
-    tried: ClassVar[list[int]] = []
-
-    def __init__(self, scratch: Path, assets: Path) -> None:
-        pass
-
-    def try_case(self, case: Case) -> Result:
-        self.tried.append(case.number)
-        again = self.tried.count(case.number) > 1
-        ended = Ended(0, "" if again or case.number else "timeout", 0.0, 0, "", "")
-        return Result(case, Action(), ended, Verdict("finished", ()))
-
-    def close(self) -> None:
-        pass
-
-
-def test_a_case_that_was_too_slow_is_tried_again_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(battery, "make_assets", lambda scratch: scratch)
-    monkeypatch.setattr(battery, "Lane", _LoadedLane)
-    monkeypatch.setattr(_LoadedLane, "tried", [])
-    results = run_cases([Case(0, number, RECIPES[0]) for number in range(3)])
-    assert [result.case.number for result in results] == [0, 1, 2]
-    assert not any(result.ended.killed for result in results)
-    assert sorted(_LoadedLane.tried) == [0, 0, 1, 2]
-    assert _LoadedLane.tried[-1] == 0
 
 
 @pytest.mark.slow
