@@ -7,7 +7,7 @@ from ..scenes.surfaces import METAL_SCENES
 from ..tables import comparison, groups, markdown
 
 TITLE = "roughness"
-TAKES = (20, 90)  # seconds on two quiet cores: quick, full
+TAKES = (8, 126)  # seconds on two quiet cores: quick, full
 KEY = "ball.bsdf.alpha.value"
 METHODS = ("prb", "sweep", "sobol")
 
