@@ -11,7 +11,7 @@ KIND = "watch"
 
 # PORT and HOST are put into what is sent.
 ASK = """
-import socket, threading, time
+import contextlib, socket, threading, time
 from pathlib import Path
 from pathreplay.report.watch import server as watch
 watch.PATIENCE = 2.0
@@ -26,7 +26,8 @@ def ask(data):
         answer = b""
         try:
             client.sendall(data.replace(b"HOST", host))
-            client.shutdown(socket.SHUT_WR)
+            with contextlib.suppress(OSError):  # ENOTCONN: the server has reset the connection, which it may
+                client.shutdown(socket.SHUT_WR)
             while part := client.recv(2**16):
                 answer += part
         except ConnectionError:

@@ -22,7 +22,7 @@ from places import DATA
 
 DATA = DATA / "vdb.zip"
 
-#: Far above what all cases take on two quiet cores, which is eight minutes.
+#: Far above what all cases take on two quiet cores, which is six minutes.
 LIMIT_S = 2400
 
 #: Of a job with edges, a baseline, stages and numbers of samples of its own, which compiles some dozens of kernels.
