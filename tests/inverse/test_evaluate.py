@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -108,20 +109,27 @@ RECORDED = pytest.mark.parametrize(
 
 
 def times_recorded(evaluate: Any) -> list[int]:
-    """Of each view, by an evaluator that was asked for one number of samples."""
+    """Of each kind of view, by an evaluator that was asked for one number of samples."""
     (recordings,) = evaluate._recordings.values()
     return [each.n_recordings for each in recordings._frozen.values()]
 
 
+def weighted(problem: Problem) -> Problem:
+    """The problem with weights for the pixels of its first view, which makes its views two kinds."""
+    first, *others = problem.views
+    weight = np.ones((*first.target.shape[:2], 1), np.float32)
+    return replace(problem, views=(replace(first, weight=weight), *others))
+
+
 @RECORDED
-def test_each_view_is_recorded_once(changes: dict[str, Any]) -> None:
-    """Whatever memory NumPy has put the values in, which differs from step to step."""
+def test_each_kind_of_view_is_recorded_once(changes: dict[str, Any]) -> None:
+    """Whatever memory NumPy has put the values in, which differs from step to step. Both views are of one kind."""
     config = make_config({**JOB, **BOX, **changes})
     problem = build_problem(config, Path.cwd())
     run = new_run(problem, problem.integrator)
     for i in range(6):
         take_step(problem, run, i)
-    assert times_recorded(run.executor.evaluate) == [1, 1]  # type: ignore[attr-defined]
+    assert times_recorded(run.executor.evaluate) == [1]  # type: ignore[attr-defined]
 
 
 @RECORDED
@@ -129,6 +137,7 @@ def test_a_view_that_comes_later_leaves_recordings_as_they_are(changes: dict[str
     """Its first evaluation changes its sensor, which all recordings hold. Actors take views from each other."""
     problem = build_problem(make_config({**JOB, **BOX, **changes}), Path.cwd())
     problem = build_problem(make_config({**JOB, **BOX, **changes}), Path.cwd(), Targets.of(problem.views))
+    problem = weighted(problem)
     values, learned = new_run(problem, problem.integrator).values, {}
     evaluate = Evaluator(problem, problem.integrator)
     for seed, view in enumerate((0, 0, 0, 1, 0, 1, 0, 1)):
@@ -140,7 +149,7 @@ def test_a_view_that_comes_later_leaves_recordings_as_they_are(changes: dict[str
 def test_pictures_leave_recordings_as_they_are(changes: dict[str, Any]) -> None:
     """Those of previews."""
     config = make_config({**JOB, **BOX, **changes})
-    problem = build_problem(config, Path.cwd())
+    problem = weighted(build_problem(config, Path.cwd()))
     run = new_run(problem, problem.integrator)
     for i in range(6):
         take_step(problem, run, i)
@@ -150,12 +159,15 @@ def test_pictures_leave_recordings_as_they_are(changes: dict[str, Any]) -> None:
 
 
 def test_views_are_not_recorded_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each recording would hold all of them."""
-    problem = problem_of(**SWEEP)
-    sensors = len(problem.scene.sensors())
-    for most, records in ((sensors, True), (sensors - 1, False)):
-        monkeypatch.setattr("pathreplay.inverse.objective.evaluate.MOST_SENSORS", most)
-        assert Evaluator(problem, problem.integrator).freezes == records
+    """Each recording would hold all of them. Two recordings of two sensors are needed here."""
+    problem = weighted(problem_of(**SWEEP))
+    values = new_run(problem, problem.integrator).values
+    for most, records in ((4, True), (3, False)):
+        monkeypatch.setattr("pathreplay.inverse.objective.evaluate.MOST_INPUTS", most)
+        evaluate = Evaluator(problem, problem.integrator)
+        for seed in range(2):
+            evaluate(values, Shard((0, 1), 4, (seed, seed)), {})
+        assert bool(evaluate._recordings) == records
 
 
 def test_a_loss_of_the_users_own_may_hold_arrays_of_numpy(room: Path) -> None:  # noqa: F811

@@ -12,8 +12,8 @@ def steps(problem, config, passes: str) -> np.ndarray:
     run = new_run(problem, problem.integrator, record=passes == "recorded")
     for i in range(4):
         take_step(problem, run, i)
-    # The first step is traced in any case; the others launch what the second recorded, view by view.
-    frozen = run.executor.evaluate._recordings[config.spp]._frozen.values()
-    recordings = [each.n_recordings for each in frozen]
-    assert recordings == [1] * len(problem.views) * (passes == "recorded"), recordings
+    # The first step is traced in any case; the others launch what was recorded, once for each kind of view.
+    evaluate = run.executor.evaluate
+    recordings = [each.n_recordings for each in evaluate._recordings[config.spp]._frozen.values()]
+    assert recordings == ([1] * evaluate._sensors.count if passes == "recorded" else []), recordings
     return np.array([[entry.loss, *entry.gradient_norms.values()] for entry in run.history])

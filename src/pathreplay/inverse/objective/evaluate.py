@@ -7,7 +7,7 @@ of an iteration to evaluators, in this process or in others.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -31,6 +31,7 @@ from pathreplay.inverse.objective.frozen import (
 )
 from pathreplay.inverse.objective.jacobian import Jacobians
 from pathreplay.inverse.objective.pixel_batches import Batch, obstacle, refused
+from pathreplay.inverse.objective.shared_sensors import SharedSensors
 from pathreplay.inverse.parameters.exposures import EXPOSURE, factor_of
 from pathreplay.inverse.parameters.exposures import gradient as exposure_gradient
 from pathreplay.inverse.parameters.gauss_newton import GaussNewton
@@ -44,9 +45,9 @@ from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
 """Number of entries from which the memory of a variable is managed explicitly (see `release`)."""
-MOST_SENSORS = 64
-"""Maximum number of sensors of a scene whose passes are recorded. The recording of each view contains all sensors, so
-memory grows with the square of the number of sensors (measured: 3 MB per view with 50 sensors, 11 MB with 200)."""
+MOST_INPUTS = 4096
+"""Maximum product of the numbers of recordings and of sensors. Each recording contains all sensors of the scene, which
+takes about 60 kB per sensor (measured: 3 MB with 50 sensors, 11 MB with 200)."""
 
 
 @dataclass(frozen=True)
@@ -214,13 +215,14 @@ class Evaluator:
         has_media = facts_of(problem.scene).has_media
         # Deterministic jobs do not record passes: recording splits kernels differently, and thus changes the last bit
         # of results.
-        known = len(problem.scene.sensors()) <= MOST_SENSORS
         # A user's loss may contain NumPy arrays. To copy one during a recording ends the process.
         loss = problem.loss not in ELSEWHERE and not isinstance(problem.loss, Own)
-        self.freezes = known and record and loss and is_recordable(self.integrator, has_media)
+        self.freezes = record and loss and is_recordable(self.integrator, has_media)
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # Keys: samples per pixel.
-        # Whether one pass computes image and gradient. Keys: view, samples per pixel, and whether pixels are batched.
-        self._sweeps: dict[tuple[int, int, bool], bool] = {}
+        # Whether one pass computes image and gradient. Keys: kind of view (see `SharedSensors`), samples per pixel, and
+        # whether pixels are batched.
+        self._sweeps: dict[tuple[Hashable, int, bool], bool] = {}
+        self._sensors: SharedSensors | None = None  # Only if passes are recorded.
         self._learned: Arrays = {}  # State of the integrator after the last evaluation.
         self._at: object = None  # `integrator.baseline` after the last evaluation. Another evaluator may replace it.
         self._begun = False
@@ -229,8 +231,7 @@ class Evaluator:
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`. Errors and warnings of the integrator are passed to the caller."""
         if self.freezes and not self._begun:
-            for about in self.problem.views:
-                make_ready(sensor_of(self.problem, about))
+            self._prepare_recordings()
         self._begun = True
 
         def each() -> Iterator[Evaluation]:
@@ -242,6 +243,13 @@ class Evaluator:
                     yield self._view(values, view, seed, shard.samples, shard.pixels)
 
         return total(each(), owned=True)
+
+    def _prepare_recordings(self) -> None:
+        """Prepare the sensors, and decide whether recordings of all kinds of views fit into memory."""
+        for about in self.problem.views:
+            make_ready(sensor_of(self.problem, about))
+        self._sensors = SharedSensors(self.problem, self._moving)
+        self.freezes = self._sensors.count * len(self.problem.scene.sensors()) <= MOST_INPUTS
 
     def _know(self, learned: Arrays) -> None:
         """Load the state ``learned`` into the integrator. Raises PathreplayError if the kinds of integrator differ."""
@@ -255,12 +263,13 @@ class Evaluator:
         """Evaluate loss, gradient and Gauss-Newton model of a view by forward-mode differentiation."""
         sensor_of(self.problem, self.problem.views[view])
         if self._jacobians is None:
-            self._jacobians = Jacobians(self.problem, self.integrator, self._moving, self.freezes)
+            sensors = self._sensors if self.freezes else None
+            self._jacobians = Jacobians(self.problem, self.integrator, self._moving, sensors)
         try:
             with plain_errors():
                 loss, gradients, dropped, model = self._jacobians.model(values, view, seed, spp)
         except NotRecordable:
-            self.freezes = self._jacobians.freezes = False
+            self.freezes, self._jacobians = False, None
             return self._second_order(values, view, seed, spp)
         release(values)
         self._learned, self._at = self.integrator.state_dict(), self.integrator.baseline
@@ -306,25 +315,26 @@ class Evaluator:
         A derivative that is not needed is None. The gradients of scene parameters are accumulated in the parameters.
         """
         problem, about = self.problem, self.problem.views[view]
-        sensor, picture, counts = about.sensor, linearized(values, about.target), about.weight
+        picture, counts = linearized(values, about.target), about.weight
         if batch is not None:
             picture, counts = batch.rows(picture), None if counts is None else batch.rows(counts)
         others = (None if part is None else owned_tensor(part) for part in (counts, factor))
         target = ViewTarget(owned_tensor(picture), *others)
         # The first call is not recorded, because Mitsuba creates some parts of a scene during its first rendering.
-        which = view, spp, batch is not None
-        records = self.freezes and which in self._sweeps
+        kind: Hashable = view if self._sensors is None else self._sensors.kind(view)
+        which = kind, spp, batch is not None
+        sensors = self._sensors if self.freezes and which in self._sweeps else None
         if which not in self._sweeps:
-            why = obstacle(problem, self.integrator, sensor, spp, batch is not None)
+            why = obstacle(problem, self.integrator, about.sensor, spp, batch is not None)
             if why and batch is not None:
                 raise refused(about.name, why)
             self._sweeps[which] = not why and view in self._reached
         # Seeds are inputs of recorded passes. Other passes take plain integers, which avoids reads from the device.
         number = dr.opaque(mi.UInt32, seed) if self.freezes else seed
-        request = RenderRequest(sensor, number, spp, batch)
+        share = about.share / len(problem.trained()) * (1 if batch is None else batch.share)
         loss = ViewLoss(
             problem.loss,
-            about.share / len(problem.trained()),
+            dr.opaque(mi.Float, share) if self.freezes else share,
             self._sweeps[which],
             EXPOSURE in self._moving,
             RESPONSE in self._moving,
@@ -332,7 +342,9 @@ class Evaluator:
         )
         problem.disk.rest()
         with plain_errors():
-            step = self._recordings[spp].differentiate if records else differentiate
+            sensor = about.sensor if sensors is None else sensors.of(view)
+            request = RenderRequest(sensor, number, spp, None if batch is None else batch.pixels)
+            step = differentiate if sensors is None else self._recordings[spp].differentiate
             found = step(problem.params, problem.scene, self.integrator, request, target, loss)
         self.integrator.keep(problem.scene, found.state)
         return float(found.loss[0]) if dr.width(found.loss) else float("nan"), found.by_factor, found.by_target

@@ -18,12 +18,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.camera_pass import Pass, Which
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import StatefulIntegrator
 from pathreplay.inverse.losses.pixelwise import Loss, mean_loss
-from pathreplay.inverse.objective.pixel_batches import Batch
 from pathreplay.inverse.parameters.exposures import derivative
 from pathreplay.samplers.streams import Stream
 from pathreplay.scenes.parameters import keep_only
@@ -34,7 +33,7 @@ _RECORDING = "while recording a frozen function"
 
 
 MOST_RECORDINGS = 8
-"""Maximum number of recordings per view. If constants of the kernels change more often, recording does not pay off."""
+"""Maximum number of recordings per sensor. If constants of kernels change more often, recording does not pay off."""
 
 
 @dataclass(frozen=True)
@@ -56,19 +55,19 @@ class ViewTarget:
 class RenderRequest:
     """Sensor, seed, samples and pixels of a rendering."""
 
-    sensor: int
+    sensor: Which
     seed: int | mi.UInt32
     spp: int
-    batch: Batch | None = None
-    """Pixels to render, one for each row of the target; None renders all. A batch requires ``ViewLoss.swept``."""
+    pixels: mi.UInt32 | None = None
+    """Pixels to render, one for each row of the target; None renders all. Some pixels require ``ViewLoss.swept``."""
 
 
 @dataclass(frozen=True)
 class ViewLoss:
-    """Loss of a view: ``share`` times the mean ``loss``."""
+    """Loss of a view: ``share`` times the mean ``loss`` of the rendered pixels."""
 
     loss: Loss
-    share: float
+    share: float | mi.Float
     swept: bool
     """Whether one pass computes image and gradient, which requires a quadratic loss."""
     by_factor: bool = True
@@ -104,12 +103,12 @@ def is_recordable(integrator: StatefulIntegrator, has_media: bool) -> bool:
 class Recordings:
     """Frozen versions of a function, such as `differentiate`.
 
-    There is one version for each combination of view, shapes of the parameters, and `SceneFacts.constants`.
+    There is one version for each combination of sensor, shapes of the parameters, and `SceneFacts.constants`.
     """
 
     def __init__(self) -> None:
         self._frozen: dict[Hashable, Callable[..., Any]] = {}
-        self._made: Counter[Hashable] = Counter()  # number of recordings, by view and shapes of the parameters
+        self._made: Counter[Hashable] = Counter()  # number of recordings, by sensor and shapes of the parameters
 
     def differentiate(
         self,
@@ -122,16 +121,16 @@ class Recordings:
     ) -> ViewResult:
         """See the function `differentiate`. Raises NotRecordable, possibly after adding a part of the gradient."""
         keys = list(params.keys())
-        # One function per view, because Dr.Jit warns about functions that are recorded often.
-        view = (request.sensor, *(dr.shape(params[key]) for key in keys))
+        # One function per sensor, because Dr.Jit warns about functions that are recorded often.
+        which = (request.sensor, *(dr.shape(params[key]) for key in keys))
         state = integrator.begin(scene).to_record()
-        return self.called(view, lambda: _recording(keys), scene, integrator, state, request, target, loss)
+        return self.called(which, lambda: _recording(keys), scene, integrator, state, request, target, loss)
 
-    def called(self, view: Hashable, make: Callable[[], Callable[..., Any]], scene: mi.Scene, *args: Any) -> Any:
+    def called(self, key: Hashable, make: Callable[[], Callable[..., Any]], scene: mi.Scene, *args: Any) -> Any:
         """Call a frozen function of a scene.
 
         Args:
-            view: key of the function.
+            key: key of the function.
             make: creates the function; called once for each key and each value of `SceneFacts.constants`.
             scene: first argument of the function.
             *args: further arguments of the function.
@@ -139,10 +138,10 @@ class Recordings:
         Raises:
             NotRecordable: a plugin of the scene prevents the recording, or the constants changed too often.
         """
-        which = view, facts_of(scene).constants()
+        which = key, facts_of(scene).constants()
         if which not in self._frozen:
-            self._made[view] += 1
-            if self._made[view] > MOST_RECORDINGS:
+            self._made[key] += 1
+            if self._made[key] > MOST_RECORDINGS:
                 raise NotRecordable
             gc.collect()  # otherwise Dr.Jit also traces scenes that are no longer in use
             self._frozen[which] = make()
@@ -188,13 +187,12 @@ def _differentiate(
 ) -> ViewResult:
     """Compute loss and gradient as `differentiate` does, in passes that start from ``state``."""
     view = integrator.pass_of(scene, request.sensor, request.seed, request.spp)
-    batch, factor = request.batch, target.factor
-    share = loss.share if batch is None else loss.share * batch.share
+    share, factor = loss.share, target.factor
     if loss.swept:
         offset, slope = (term * share for term in linear_derivative(loss.loss, target.target, target.weight))
         # Chain rule: the loss is evaluated at factor * image, so offset is multiplied by factor and slope by factor².
         wanted = _times(offset, factor), _times(_times(slope, factor), factor)
-        image, state = integrator.pixel_pass(view, wanted, None if batch is None else batch.pixels, state)
+        image, state = integrator.pixel_pass(view, wanted, request.pixels, state)
         value = target.compared(loss.loss, image) * share
         terms = [(1.0, image)]
     else:

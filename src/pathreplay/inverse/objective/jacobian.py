@@ -6,7 +6,8 @@ differentiation renders one tangent image per entry, with the same random number
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Hashable
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +16,7 @@ import numpy as np
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.stateful import StatefulIntegrator
 from pathreplay.inverse.objective.frozen import Recordings, RenderRequest, linear_derivative
+from pathreplay.inverse.objective.shared_sensors import SharedSensors
 from pathreplay.inverse.parameters.exposures import EXPOSURE, derivatives_by_factors, factor_of
 from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Half, Matrix, model_of
 from pathreplay.inverse.parameters.values import Array, Arrays
@@ -34,13 +36,15 @@ class Jacobians:
         problem: the problem, with a quadratic loss.
         integrator: integrator of the problem.
         moving: keys of the variables.
-        record: whether passes are recorded as frozen functions.
+        sensors: sensors of passes that are recorded as frozen functions; None if no pass is recorded.
     """
 
-    def __init__(self, problem: Problem, integrator: StatefulIntegrator, moving: Collection[str], record: bool) -> None:
-        self.problem, self.integrator, self.freezes = problem, integrator, record
+    def __init__(
+        self, problem: Problem, integrator: StatefulIntegrator, moving: Collection[str], sensors: SharedSensors | None
+    ) -> None:
+        self.problem, self.integrator, self._sensors = problem, integrator, sensors
         self._recordings = Recordings()
-        self._traced: set[tuple[str, int]] = set()  # pairs of a variable (or IMAGE) and a view
+        self._traced: set[tuple[str, Hashable]] = set()  # pairs of a variable (or IMAGE) and a kind of view
         self._moving = [v.key for v in problem.variables if v.key in moving]
         self._reached = {key: problem.reached(frozenset({key})) if key != EXPOSURE else set() for key in self._moving}
 
@@ -72,7 +76,7 @@ class Jacobians:
         )
         seeds = [int(s) for s in np.random.SeedSequence([seed]).generate_state(2)]
         # Seeds are inputs of recorded passes, as in `Evaluator`.
-        opaque = [dr.opaque(mi.UInt32, half) if self.freezes else half for half in seeds]
+        opaque = [half if self._sensors is None else dr.opaque(mi.UInt32, half) for half in seeds]
         a, b = (self._half(values, view, RenderRequest(about.sensor, half, spp // 2)) for half in opaque)
         dropped = {}
         begin = 0
@@ -138,22 +142,24 @@ class Jacobians:
     def _pass(self, key: str, view: int, request: RenderRequest) -> Array:
         """Render the image, or its derivative along the tangent of a variable.
 
-        If passes are recorded, the first call for a pair of key and view is not recorded. Later calls use a recorded
-        pass.
+        If passes are recorded, the first call for a pair of key and kind of view is not recorded. Later calls use a
+        recorded pass.
         """
         scene, integrator, run = self.problem.scene, self.integrator, _image if key == IMAGE else _tangent
         state = integrator.begin(scene)
         # The first call is not recorded: see `Evaluator`.
-        if self.freezes and (key, view) in self._traced:
+        kind = view if self._sensors is None else self._sensors.kind(view)
+        if self._sensors is not None and (key, kind) in self._traced:
+            request = replace(request, sensor=self._sensors.of(view))
             which = key, request.sensor, request.spp
             arguments = scene, integrator, state.to_record(), request
             image, state = self._recordings.called(which, lambda: dr.freeze(run), *arguments)
         else:
             image, state = run(scene, integrator, state, request)
-        self._traced.add((key, view))
+        self._traced.add((key, kind))
         integrator.keep(scene, state)
         result = np.array(image, np.float32)
-        film = scene.sensors()[request.sensor].film()
+        film = scene.sensors()[self.problem.views[view].sensor].film()
         if key != IMAGE and mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
             # Alpha has no derivative. Mitsuba's integrators write alpha itself into this channel of tangents.
             result[..., film.base_channels_count() - 1] = 0
