@@ -7,9 +7,8 @@ gets copies of the arrays of a view's camera before each pass.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Hashable
-from typing import Any
 
 import mitsuba as mi
 
@@ -18,8 +17,8 @@ from pathreplay.integrators.film.image import fit_film
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.owned_arrays import owned
 
-_ARRAYS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "to_world")
-"""Parameters that `perspective` stores as arrays. Its other parameters are constants of kernels."""
+_NUMBERS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
+"""Parameters that `perspective` stores as arrays, besides ``to_world``. Others are constants of kernels."""
 
 
 class SharedSensors:
@@ -36,21 +35,16 @@ class SharedSensors:
         moved = {problem.params.properties[key][2] for key in problem.moves(moving)}
         kinds: list[Hashable] = []
         first: dict[Hashable, mi.Sensor] = {}
-        sizes: defaultdict[Hashable, int] = defaultdict(int)
         for n, view in enumerate(problem.views):
             sensor = problem.scene.sensors()[view.sensor]
             constants = None if sensor in moved else _constants(sensor)
-            kind = view.sensor if constants is None else (constants, view.weight is None, n in reached)
-            kinds.append(kind)
-            sizes[kind] += 1
-            first.setdefault(kind, sensor)
-        self._kinds = [
-            kind if sizes[kind] > 1 else view.sensor for kind, view in zip(kinds, problem.views, strict=True)
-        ]
-        """The index of a view's sensor, or what several views have in common."""
-        common = set(self._kinds) - set(range(len(problem.scene.sensors())))
+            kinds.append(view.sensor if constants is None else (constants, view.weight is None, n in reached))
+            first.setdefault(kinds[-1], sensor)
+        common = {kind for kind, views in Counter(kinds).items() if views > 1 and not isinstance(kind, int)}
+        self._kinds = [kind if kind in common else view.sensor for kind, view in zip(kinds, problem.views, strict=True)]
+        """What several views have in common, or the index of the sensor of a view."""
         self._shared = {kind: (first[kind], _like(first[kind])) for kind in common}
-        """The first sensor and the shared sensor of each kind. They have the same film."""
+        """The sensor of the first view of each kind, and the shared sensor. They have the same film."""
 
     @property
     def count(self) -> int:
@@ -69,8 +63,11 @@ class SharedSensors:
         first, shared = self._shared[self._kinds[view]]
         fit_film(first, about.target.shape)  # the update below adapts the shared sensor to the film
         values, params = mi.traverse(self._problem.scene.sensors()[about.sensor]), mi.traverse(shared)
-        for key in _ARRAYS:
-            params[key] = _copy(values[key])
+        # If the sensors shared an array, a recording would treat it as a single input.
+        for key in _NUMBERS:
+            params[key] = owned(values[key])
+        place = values["to_world"]
+        params["to_world"] = type(place)(owned(place.matrix))
         params.update()
         shared.film().prepare([])  # what an earlier pass has left in the film is an input of recordings, too
         return shared
@@ -104,8 +101,3 @@ def _like(sensor: mi.Sensor) -> mi.Sensor:
     if (medium := sensor.get_medium()) is not None:
         shared.set_medium(medium)
     return shared
-
-
-def _copy(value: Any) -> Any:
-    """Copy an array or a transform. If sensors shared an array, a recording would treat it as a single input."""
-    return type(value)(owned(value.matrix)) if hasattr(value, "matrix") else owned(value)
