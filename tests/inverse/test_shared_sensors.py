@@ -92,6 +92,18 @@ def test_shared_passes_give_the_losses_and_gradients_of_each_view(changes: dict[
     assert_same(found, wanted)
 
 
+def test_cameras_inside_a_medium_share_passes() -> None:
+    """The medium is optimised, too."""
+    fog = """<medium type="homogeneous" id="fog"><float name="albedo" value="0.5"/><float name="sigma_t" value="0.1"/>
+      </medium>"""
+    cameras = [each.replace("</sensor>", '<ref id="fog"/></sensor>') for each in ALIKE]
+    problem = problem_of([fog, *cameras], parameters=[*JOB["parameters"], {"key": "*.sigma_t.value.value"}])  # type: ignore[misc]
+    recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
+    found, wanted = evaluations(recorded, 2), evaluations(traced, 2)
+    assert recordings(recorded) == [1]
+    assert_same(found, wanted)
+
+
 def test_views_have_pixels_and_shares_of_their_own() -> None:
     """The fraction of pixels that a mask leaves differs from view to view, and so does the weight of a view."""
     problem, views = problem_of(ALIKE), []
