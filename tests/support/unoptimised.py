@@ -30,8 +30,18 @@ def keep_apart() -> None:
     os.environ["DRJIT_CACHE_DIR"] = str(folder)
 
 
-def leave_unoptimised(*more: str) -> None:
-    """Have the LLVM that Dr.Jit has loaded compile so from now on, with further options of its own."""
+def leave_unoptimised(*more: str, library: str = "") -> None:
+    """Have an LLVM compile so from now on, by default that of Dr.Jit, with further options of its own."""
     arguments = [option.encode() for option in ("drjit", *OPTIONS, *more)]
-    llvm = ctypes.CDLL(os.environ["DRJIT_LIBLLVM_PATH"])
+    llvm = ctypes.CDLL(library or os.environ["DRJIT_LIBLLVM_PATH"])
     llvm.LLVMParseCommandLineOptions(len(arguments), (ctypes.c_char_p * len(arguments))(*arguments), None)
+
+
+def first_line() -> str:
+    """Code with which a fresh Python does so, if this process does, and Dr.Jit is to load the same LLVM there."""
+    if not is_asked_for() or not (library := os.environ.get("DRJIT_LIBLLVM_PATH")):
+        return ""
+    here = str(Path(__file__).parent)
+    return f"import sys; sys.path.insert(0, {here!r}); import unoptimised; del sys.path[0]; " + (
+        f"unoptimised.leave_unoptimised(library={library!r}); del sys, unoptimised\n"
+    )
