@@ -23,6 +23,9 @@ from typing import Any, NoReturn
 MEMORY_LIMIT_MB = 4096
 POLL_S = 0.02
 
+#: Of this process before it imports anything, for processes that start anew.
+ENVIRONMENT = dict(os.environ)
+
 #: What most cases import, two seconds of work. No name of theirs is used here.
 IMPORTED = ("pathreplay.cli", "pathreplay.jobs.job", "pathreplay.testing.command")
 
@@ -36,7 +39,8 @@ def serve() -> None:
     unoptimised.keep_apart()
     for module in IMPORTED:
         importlib.import_module(module)
-    unoptimised.leave_unoptimised()
+    if "DRJIT_LIBLLVM_PATH" in os.environ:
+        unoptimised.leave_unoptimised()
 
     for line in sys.stdin:
         request = json.loads(line)
@@ -117,7 +121,7 @@ def _child(request: dict[str, Any]) -> None:
         os.close(file)
     sys.stdin = open(0, closefd=False)
     if request["shell"]:
-        os.execvp("bash", ["bash", "-c", request["shell"]])
+        os.execvpe("bash", ["bash", "-c", request["shell"]], ENVIRONMENT)
     if request["script"]:
         _run_script(request["script"])
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,9 +35,7 @@ UNLIKE = {
     "high": camera("high", 0.5, height=11),
     "soft": camera("soft", 0.5, filter=SOFT.format(0.401)),
     "softer": camera("softer", 0.5, filter=SOFT.format(0.402)),
-    "lens": re.sub(
-        '<float name="principal[^>]*>', "", camera("lens", 0.5, more='<float name="aperture_radius" value="0.05"/>')
-    ).replace("perspective", "thinlens"),
+    "other": camera("other", 0.5, more='<sampler type="stratified"/>'),
     "moving": camera("moving", 0.5),
 }
 MOVES = {"key": "moving.to_world", "pose": "rigid", "initial": {"translation": [0.1, 0, 0]}}
@@ -66,6 +63,7 @@ def recordings(evaluate: Evaluator) -> list[int]:
 
 def assert_same(found: list[Evaluation], wanted: list[Evaluation]) -> None:
     for a, b in zip(found, wanted, strict=True):
+        assert a.gradients.keys() == b.gradients.keys() and a.gradients
         assert a.loss == pytest.approx(b.loss, rel=1e-5)
         for key, gradient in a.gradients.items():
             np.testing.assert_allclose(gradient, b.gradients[key], rtol=1e-3, atol=1e-5 * np.abs(gradient).max())
@@ -113,17 +111,36 @@ def test_views_have_pixels_and_shares_of_their_own() -> None:
         views.append(replace(view, weight=weight, share=0.5 * (1 + n)))
     problem = replace(problem, views=tuple(views))
     recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
-    for pixels in (None, 30):
-        assert_same(evaluations(recorded, 2, pixels=pixels), evaluations(traced, 2, pixels=pixels))
-    assert recordings(recorded) == [2]  # all pixels, and some
+    for pixels in (None, 60):  # the first mask leaves 48
+        assert_same(evaluations(recorded, 3, pixels=pixels), evaluations(traced, 3, pixels=pixels))
+    assert recordings(recorded) == [1, 1, 1]  # with all pixels, with 48 and with 60
 
 
 def test_cameras_whose_constants_differ_share_nothing() -> None:
     problem = problem_of([*ALIKE, *UNLIKE.values()], parameters=[*JOB["parameters"], MOVES])  # type: ignore[misc]
     recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
-    found, wanted = evaluations(recorded, 3), evaluations(traced, 3)
-    assert recorded._sensors is not None and recorded._sensors.count == 1 + len(UNLIKE)
-    assert_same(found, wanted)
+    assert_same(evaluations(recorded, 3), evaluations(traced, 3))
+    assert recordings(recorded) == [1] * (1 + len(UNLIKE))
+
+
+def test_two_kinds_do_not_disturb_each_other() -> None:
+    """Square and portrait, in turn."""
+    square = [camera(name, x, height=12) for name, x in (("d", -1.0), ("e", 0.6), ("f", 1.0))]
+    turned = [camera(name, x, height=16) for name, x in (("g", -1.0), ("h", 0.6), ("i", 1.0))]
+    problem = problem_of([each for pair in zip(square, turned, strict=True) for each in pair])
+    recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
+    assert_same(evaluations(recorded, 3), evaluations(traced, 3))
+    assert recordings(recorded) == [1, 1]
+
+
+def test_an_evaluator_that_comes_later_leaves_recordings_as_they_are() -> None:
+    """That of a baseline, say: it begins when the other has made its first step."""
+    problem = problem_of(ALIKE)
+    first, second = (Evaluator(problem, problem.integrator) for _ in range(2))
+    for _ in range(2):
+        evaluations(first, 1)
+        evaluations(second, 1)
+    assert recordings(first) == recordings(second) == [1]
 
 
 def test_a_view_is_seen_from_where_its_camera_is_put_later() -> None:

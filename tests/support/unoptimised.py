@@ -2,7 +2,8 @@
 
     PATHREPLAY_TEST_KERNELS=unoptimised python -m pytest ...
 
-is what `make test` does; `make test-all` runs the same tests with the kernels that users have. Dr.Jit knows a kernel by
+is what `make test` does; `make test-all` runs the same tests with the kernels that users have, but for hostile cases,
+which are forks of a process with unoptimised kernels (`hostile/server.py`). Dr.Jit knows a kernel by
 its code, and not by how it was compiled: so these are kept in a folder of their own.
 """
 

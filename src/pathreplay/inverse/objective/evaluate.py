@@ -46,8 +46,8 @@ from pathreplay.scenes.parameters import get_array
 LARGE = 2**22
 """Number of entries from which the memory of a variable is managed explicitly (see `release`)."""
 MOST_INPUTS = 4096
-"""Maximum product of the numbers of recordings and of sensors. Each recording contains all sensors of the scene, which
-takes about 60 kB per sensor (measured: 3 MB with 50 sensors, 11 MB with 200)."""
+"""Maximum number of sensors, times the number of kinds of views. Each kind is recorded, and a recording contains all
+sensors of the scene, about 60 kB per sensor (measured: 3 MB with 50 sensors, 11 MB with 200)."""
 
 
 @dataclass(frozen=True)
@@ -217,21 +217,30 @@ class Evaluator:
         # of results.
         # A user's loss may contain NumPy arrays. To copy one during a recording ends the process.
         loss = problem.loss not in ELSEWHERE and not isinstance(problem.loss, Own)
-        self.freezes = record and loss and is_recordable(self.integrator, has_media)
+        recordable = record and loss and is_recordable(self.integrator, has_media)
+        sensors = SharedSensors(problem, self._moving) if recordable else None
+        if sensors is not None and sensors.count * len(problem.scene.sensors()) > MOST_INPUTS:
+            sensors = None
+        self._sensors = sensors  # None if passes are not recorded
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # Keys: samples per pixel.
         # Whether one pass computes image and gradient. Keys: kind of view (see `SharedSensors`), samples per pixel, and
         # whether pixels are batched.
         self._sweeps: dict[tuple[Hashable, int, bool], bool] = {}
-        self._sensors: SharedSensors | None = None  # Only if passes are recorded.
         self._learned: Arrays = {}  # State of the integrator after the last evaluation.
         self._at: object = None  # `integrator.baseline` after the last evaluation. Another evaluator may replace it.
         self._begun = False
         self._jacobians: Jacobians | None = None
 
+    @property
+    def freezes(self) -> bool:
+        """Whether passes are recorded. The first attempt may show that they cannot be recorded."""
+        return self._sensors is not None
+
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`. Errors and warnings of the integrator are passed to the caller."""
         if self.freezes and not self._begun:
-            self._prepare_recordings()
+            for about in self.problem.views:
+                make_ready(sensor_of(self.problem, about))
         self._begun = True
 
         def each() -> Iterator[Evaluation]:
@@ -243,13 +252,6 @@ class Evaluator:
                     yield self._view(values, view, seed, shard.samples, shard.pixels)
 
         return total(each(), owned=True)
-
-    def _prepare_recordings(self) -> None:
-        """Prepare the sensors, and decide whether recordings of all kinds of views fit into memory."""
-        for about in self.problem.views:
-            make_ready(sensor_of(self.problem, about))
-        self._sensors = SharedSensors(self.problem, self._moving)
-        self.freezes = self._sensors.count * len(self.problem.scene.sensors()) <= MOST_INPUTS
 
     def _know(self, learned: Arrays) -> None:
         """Load the state ``learned`` into the integrator. Raises PathreplayError if the kinds of integrator differ."""
@@ -263,13 +265,12 @@ class Evaluator:
         """Evaluate loss, gradient and Gauss-Newton model of a view by forward-mode differentiation."""
         sensor_of(self.problem, self.problem.views[view])
         if self._jacobians is None:
-            sensors = self._sensors if self.freezes else None
-            self._jacobians = Jacobians(self.problem, self.integrator, self._moving, sensors)
+            self._jacobians = Jacobians(self.problem, self.integrator, self._moving, self._sensors)
         try:
             with plain_errors():
                 loss, gradients, dropped, model = self._jacobians.model(values, view, seed, spp)
         except NotRecordable:
-            self.freezes, self._jacobians = False, None
+            self._sensors = self._jacobians = None
             return self._second_order(values, view, seed, spp)
         release(values)
         self._learned, self._at = self.integrator.state_dict(), self.integrator.baseline
@@ -288,7 +289,7 @@ class Evaluator:
             batch = None if pixels is None else Batch.of(about.weight, about.target.shape[:2], pixels, seed)
             loss, by_factor, by_target = self._differentiated(values, view, seed, spp, factor, batch)
         except NotRecordable:  # a part of the gradient may have been added: start again with a zero gradient
-            self.freezes = False
+            self._sensors = None
             return self._view(values, view, seed, spp, pixels)
         gradients = {}
         for key, value in moving.items():
@@ -321,9 +322,9 @@ class Evaluator:
         others = (None if part is None else owned_tensor(part) for part in (counts, factor))
         target = ViewTarget(owned_tensor(picture), *others)
         # The first call is not recorded, because Mitsuba creates some parts of a scene during its first rendering.
-        kind: Hashable = view if self._sensors is None else self._sensors.kind(view)
+        kind = about.sensor if self._sensors is None else self._sensors.kind(view)
         which = kind, spp, batch is not None
-        sensors = self._sensors if self.freezes and which in self._sweeps else None
+        sensors = self._sensors if which in self._sweeps else None
         if which not in self._sweeps:
             why = obstacle(problem, self.integrator, about.sensor, spp, batch is not None)
             if why and batch is not None:

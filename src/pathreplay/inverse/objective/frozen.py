@@ -59,7 +59,7 @@ class RenderRequest:
     seed: int | mi.UInt32
     spp: int
     pixels: mi.UInt32 | None = None
-    """Pixels to render, one for each row of the target; None renders all. Some pixels require ``ViewLoss.swept``."""
+    """Pixels to render, one for each row of the target; None renders all. A subset requires ``ViewLoss.swept``."""
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,13 @@ def is_recordable(integrator: StatefulIntegrator, has_media: bool) -> bool:
 class Recordings:
     """Frozen versions of a function, such as `differentiate`.
 
-    There is one version for each combination of sensor, shapes of the parameters, and `SceneFacts.constants`.
+    There is one version for each combination of sensor, number of pixels, shapes of the parameters, and
+    `SceneFacts.constants`.
     """
 
     def __init__(self) -> None:
         self._frozen: dict[Hashable, Callable[..., Any]] = {}
-        self._made: Counter[Hashable] = Counter()  # number of recordings, by sensor and shapes of the parameters
+        self._made: Counter[Hashable] = Counter()  # number of recordings, by the key of `called`
 
     def differentiate(
         self,
@@ -121,8 +122,10 @@ class Recordings:
     ) -> ViewResult:
         """See the function `differentiate`. Raises NotRecordable, possibly after adding a part of the gradient."""
         keys = list(params.keys())
-        # One function per sensor, because Dr.Jit warns about functions that are recorded often.
-        which = (request.sensor, *(dr.shape(params[key]) for key in keys))
+        # Recorded passes contain the number of pixels. One function per sensor, because Dr.Jit warns about functions
+        # that are recorded often.
+        pixels = None if request.pixels is None else dr.width(request.pixels)
+        which = (request.sensor, pixels, *(dr.shape(params[key]) for key in keys))
         state = integrator.begin(scene).to_record()
         return self.called(which, lambda: _recording(keys), scene, integrator, state, request, target, loss)
 

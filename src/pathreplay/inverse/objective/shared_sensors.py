@@ -7,14 +7,16 @@ gets copies of the arrays of a view's camera before each pass.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Hashable
 
+import drjit as dr
 import mitsuba as mi
 
 from pathreplay.integrators.camera_pass import Which
+from pathreplay.integrators.film.camera_flow import PINHOLE
 from pathreplay.integrators.film.image import fit_film
-from pathreplay.inverse.problem.problem import Problem
+from pathreplay.inverse.problem.problem import Problem, sensor_of
 from pathreplay.platform.owned_arrays import owned
 
 _NUMBERS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
@@ -22,66 +24,80 @@ _NUMBERS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
 
 
 class SharedSensors:
-    """Groups the views of a problem by their kind: views of the same kind can share recorded passes.
+    """Groups the training views of a problem: views of the same kind can share recorded passes.
+
+    Resizes the films of all sensors to the target images.
 
     Args:
-        problem: the problem. The films of its sensors have the sizes of the target images.
+        problem: the problem.
         moving: variables that are differentiated.
     """
 
     def __init__(self, problem: Problem, moving: frozenset[str]) -> None:
         self._problem = problem
+        self._shared: dict[Hashable, tuple[mi.Sensor, mi.Sensor]] = {}
+        """The sensor of the first view of each kind, and the shared sensor. They have the same film."""
+        self._kinds: dict[int, Hashable] = {}
+        """Kinds of the views that share a sensor."""
+        for view in problem.views:
+            sensor_of(problem, view)
         reached = problem.reached(moving)
         moved = {problem.params.properties[key][2] for key in problem.moves(moving)}
-        kinds: list[Hashable] = []
-        first: dict[Hashable, mi.Sensor] = {}
-        for n, view in enumerate(problem.views):
+        alike: defaultdict[Hashable, list[int]] = defaultdict(list)
+        for n, view in problem.trained().items():
             sensor = problem.scene.sensors()[view.sensor]
-            constants = None if sensor in moved else _constants(sensor)
-            kinds.append(view.sensor if constants is None else (constants, view.weight is None, n in reached))
-            first.setdefault(kinds[-1], sensor)
-        common = {kind for kind, views in Counter(kinds).items() if views > 1 and not isinstance(kind, int)}
-        self._kinds = [kind if kind in common else view.sensor for kind, view in zip(kinds, problem.views, strict=True)]
-        """What several views have in common, or the index of the sensor of a view."""
-        self._shared = {kind: (first[kind], _like(first[kind])) for kind in common}
-        """The sensor of the first view of each kind, and the shared sensor. They have the same film."""
+            if sensor not in moved and _is_known(sensor):
+                alike[_constants(sensor), view.weight is None, n in reached].append(n)
+        for kind, views in alike.items():
+            if len(views) > 1:
+                first = problem.scene.sensors()[problem.views[views[0]].sensor]
+                self._shared[kind] = first, _like(first)
+                self._kinds |= dict.fromkeys(views, kind)
 
     @property
     def count(self) -> int:
-        """Number of kinds."""
-        return len(set(self._kinds))
+        """Number of kinds of training views."""
+        return len({self.kind(n) for n in self._problem.trained()})
 
     def kind(self, view: int) -> Hashable:
-        """Return the kind of a view."""
-        return self._kinds[view]
+        """Return the kind of a view: what several views have in common, or the index of the view's sensor."""
+        return self._kinds.get(view, self._problem.views[view].sensor)
 
     def of(self, view: int) -> Which:
         """Return the sensor of a recorded pass: the shared sensor with the arrays of the view, or the view's sensor."""
         about = self._problem.views[view]
-        if self._kinds[view] not in self._shared:
+        if view not in self._kinds:
             return about.sensor
         first, shared = self._shared[self._kinds[view]]
         fit_film(first, about.target.shape)  # the update below adapts the shared sensor to the film
         values, params = mi.traverse(self._problem.scene.sensors()[about.sensor]), mi.traverse(shared)
         # If the sensors shared an array, a recording would treat it as a single input.
-        for key in _NUMBERS:
-            params[key] = owned(values[key])
-        place = values["to_world"]
-        params["to_world"] = type(place)(owned(place.matrix))
+        numbers, place = [owned(values[key]) for key in _NUMBERS], values["to_world"]
+        matrix = owned(place.matrix)
+        dr.eval(numbers, matrix)
+        for key, number in zip(_NUMBERS, numbers, strict=True):
+            params[key] = number
+        params["to_world"] = type(place)(matrix)
         params.update()
         shared.film().prepare([])  # what an earlier pass has left in the film is an input of recordings, too
         return shared
 
 
+def _is_known(sensor: mi.Sensor) -> bool:
+    """Return whether `_constants` describes all constants of a sensor."""
+    # Random numbers depend on the seed of a pass. The seed of an `independent` sampler itself may therefore differ.
+    parts = sensor.class_name(), sensor.film().class_name(), sensor.sampler().class_name()
+    return parts == (PINHOLE, "HDRFilm", "IndependentSampler")
+
+
 def _constants(sensor: mi.Sensor) -> Hashable:
-    """Return what kernels treat as constants of a sensor, or None if it is of a type whose constants are not known."""
+    """Return what kernels treat as constants of a perspective camera."""
     film, rfilter = sensor.film(), sensor.film().rfilter()
-    if sensor.class_name() != "PerspectiveCamera" or film.class_name() != "HDRFilm":
-        return None
     # The description of a film rounds the parameters of its filter.
-    shape = tuple(float(rfilter.eval(rfilter.radius() * x)[0]) for x in (0, 0.3, 0.6))
+    radius = float(rfilter.radius())
+    weights = tuple(rfilter.eval(mi.Float([0, 0.3 * radius, 0.6 * radius])).numpy().tolist())
     numbers = sensor.near_clip(), sensor.far_clip(), sensor.shutter_open(), sensor.shutter_open_time()
-    return str(film), rfilter.radius(), shape, str(sensor.sampler()), numbers, sensor.get_medium()
+    return str(film), radius, weights, numbers, sensor.get_medium()
 
 
 def _like(sensor: mi.Sensor) -> mi.Sensor:
