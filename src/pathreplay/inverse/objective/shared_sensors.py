@@ -16,7 +16,7 @@ import mitsuba as mi
 from pathreplay.integrators.camera_pass import Which
 from pathreplay.integrators.film.camera_flow import PINHOLE
 from pathreplay.integrators.film.image import fit_film
-from pathreplay.inverse.problem.problem import Problem, sensor_of
+from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.owned_arrays import owned
 
 _NUMBERS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
@@ -25,8 +25,6 @@ _NUMBERS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
 
 class SharedSensors:
     """Groups the training views of a problem: views of the same kind can share recorded passes.
-
-    Resizes the films of all sensors to the target images.
 
     Args:
         problem: the problem.
@@ -39,15 +37,14 @@ class SharedSensors:
         """The sensor of the first view of each kind, and the shared sensor. They have the same film."""
         self._kinds: dict[int, Hashable] = {}
         """Kinds of the views that share a sensor."""
-        for view in problem.views:
-            sensor_of(problem, view)
         reached = problem.reached(moving)
         moved = {problem.params.properties[key][2] for key in problem.moves(moving)}
         alike: defaultdict[Hashable, list[int]] = defaultdict(list)
         for n, view in problem.trained().items():
             sensor = problem.scene.sensors()[view.sensor]
             if sensor not in moved and _is_known(sensor):
-                alike[_constants(sensor), view.weight is None, n in reached].append(n)
+                size = tuple(view.target.shape)  # of the film, once a pass has begun
+                alike[_constants(sensor), size, view.weight is None, n in reached].append(n)
         for kind, views in alike.items():
             if len(views) > 1:
                 first = problem.scene.sensors()[problem.views[views[0]].sensor]
