@@ -18,6 +18,7 @@ from pathreplay.inverse.problem.problem import Problem, build_problem
 from pathreplay.jobs import make_config
 from pathreplay.platform.interrupts import Stop
 from pathreplay.platform.threads import one_thread
+from recorded_steps import times_recorded
 from room_job import CLOUD, JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
 SWEEP = {"integrator": {"type": "pathreplay", "max_depth": 3, "boundary": "none"}}
@@ -106,12 +107,6 @@ BOX = {
 RECORDED = pytest.mark.parametrize(
     "changes", [SWEEP, {}, {**SWEEP, "loss": "l1"}, KINDS["medium"]], ids=["sweep", "prb", "l1", "medium"]
 )
-
-
-def times_recorded(evaluate: Any) -> list[int]:
-    """Of each kind of view, by an evaluator that was asked for one number of samples."""
-    (recordings,) = evaluate._recordings.values()
-    return [each.n_recordings for each in recordings._frozen.values()]
 
 
 def weighted(problem: Problem) -> Problem:

@@ -14,6 +14,7 @@ from pathreplay.inverse.objective.evaluate import Evaluation, Evaluator, Shard
 from pathreplay.inverse.problem.problem import Problem, build_problem
 from pathreplay.jobs import make_config
 from pathreplay.scenes.parameters import get_array
+from recorded_steps import times_recorded
 from room_job import JOB, SCENE, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
 #: Cameras as captures have them: of one size, each with its place, its lens and its principal point.
@@ -56,9 +57,8 @@ def evaluations(evaluate: Evaluator, rounds: int, **shard: Any) -> list[Evaluati
     return [evaluate(values, shard, {}) for shard in shards]
 
 
-def recordings(evaluate: Evaluator) -> list[int]:
-    """How often each frozen function was recorded."""
-    return [each.n_recordings for several in evaluate._recordings.values() for each in several._frozen.values()]
+def recorded_and_traced(problem: Problem) -> tuple[Evaluator, Evaluator]:
+    return Evaluator(problem, problem.integrator), Evaluator(problem, problem.integrator, record=False)
 
 
 def assert_same(found: list[Evaluation], wanted: list[Evaluation]) -> None:
@@ -83,9 +83,9 @@ def assert_same(found: list[Evaluation], wanted: list[Evaluation]) -> None:
 )
 def test_shared_passes_give_the_losses_and_gradients_of_each_view(changes: dict[str, Any]) -> None:
     problem = problem_of(ALIKE, **changes)
-    recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
+    recorded, traced = recorded_and_traced(problem)
     found, wanted = evaluations(recorded, 2), evaluations(traced, 2)
-    assert recordings(recorded) == [1] and not recordings(traced)
+    assert times_recorded(recorded) == [1] and not times_recorded(traced)
     assert len({evaluation.loss for evaluation in wanted}) == 6
     assert_same(found, wanted)
 
@@ -96,9 +96,9 @@ def test_cameras_inside_a_medium_share_passes() -> None:
       </medium>"""
     cameras = [each.replace("</sensor>", '<ref id="fog"/></sensor>') for each in ALIKE]
     problem = problem_of([fog, *cameras], parameters=[*JOB["parameters"], {"key": "*.sigma_t.value.value"}])  # type: ignore[misc]
-    recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
+    recorded, traced = recorded_and_traced(problem)
     found, wanted = evaluations(recorded, 2), evaluations(traced, 2)
-    assert recordings(recorded) == [1]
+    assert times_recorded(recorded) == [1]
     assert_same(found, wanted)
 
 
@@ -110,17 +110,17 @@ def test_views_have_pixels_and_shares_of_their_own() -> None:
         weight[: 4 + 2 * n] = 10 / (4 + 2 * n)
         views.append(replace(view, weight=weight, share=0.5 * (1 + n)))
     problem = replace(problem, views=tuple(views))
-    recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
+    recorded, traced = recorded_and_traced(problem)
     for pixels in (None, 60):  # the first mask leaves 48
         assert_same(evaluations(recorded, 3, pixels=pixels), evaluations(traced, 3, pixels=pixels))
-    assert recordings(recorded) == [1, 1, 1]  # with all pixels, with 48 and with 60
+    assert times_recorded(recorded) == [1, 1, 1]  # with all pixels, with 48 and with 60
 
 
 def test_cameras_whose_constants_differ_share_nothing() -> None:
     problem = problem_of([*ALIKE, *UNLIKE.values()], parameters=[*JOB["parameters"], MOVES])  # type: ignore[misc]
-    recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
+    recorded, traced = recorded_and_traced(problem)
     assert_same(evaluations(recorded, 3), evaluations(traced, 3))
-    assert recordings(recorded) == [1] * (1 + len(UNLIKE))
+    assert times_recorded(recorded) == [1] * (1 + len(UNLIKE))
 
 
 def test_two_kinds_do_not_disturb_each_other() -> None:
@@ -128,9 +128,9 @@ def test_two_kinds_do_not_disturb_each_other() -> None:
     square = [camera(name, x, height=12) for name, x in (("d", -1.0), ("e", 0.6), ("f", 1.0))]
     turned = [camera(name, x, height=16) for name, x in (("g", -1.0), ("h", 0.6), ("i", 1.0))]
     problem = problem_of([each for pair in zip(square, turned, strict=True) for each in pair])
-    recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
+    recorded, traced = recorded_and_traced(problem)
     assert_same(evaluations(recorded, 3), evaluations(traced, 3))
-    assert recordings(recorded) == [1, 1]
+    assert times_recorded(recorded) == [1, 1]
 
 
 def test_an_evaluator_that_comes_later_leaves_recordings_as_they_are() -> None:
@@ -140,7 +140,7 @@ def test_an_evaluator_that_comes_later_leaves_recordings_as_they_are() -> None:
     for _ in range(2):
         evaluations(first, 1)
         evaluations(second, 1)
-    assert recordings(first) == recordings(second) == [1]
+    assert times_recorded(first) == times_recorded(second) == [1]
 
 
 def test_a_view_is_seen_from_where_its_camera_is_put_later() -> None:
@@ -154,12 +154,12 @@ def test_a_view_is_seen_from_where_its_camera_is_put_later() -> None:
     params.update()
     traced = Evaluator(problem, problem.integrator, False)
     assert_same(evaluations(evaluate, 1), evaluations(traced, 1))
-    assert recordings(evaluate) == [1]
+    assert times_recorded(evaluate) == [1]
 
 
 def test_derivatives_by_forward_mode_share_passes() -> None:
     problem = problem_of(ALIKE, parameters=[{"key": "floor.reflectance.*", "initial": 0.5}])
-    recorded, traced = (Evaluator(problem, problem.integrator, record) for record in (True, False))
+    recorded, traced = recorded_and_traced(problem)
     found, wanted = (evaluations(each, 2, second_order=True) for each in (recorded, traced))
     assert_same(found, wanted)
     assert recorded._jacobians is not None

@@ -22,6 +22,7 @@ from pathreplay.library.iterations import run_of
 from pathreplay.platform.interrupts import Stop
 from pathreplay.platform.threads import one_thread
 from pathreplay.scenes.parameters import get_array
+from recorded_steps import times_recorded
 from room_job import CLOUD, JOB, SCENE, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 from small_job import checkpoint_bits
 
@@ -129,8 +130,7 @@ def test_films_are_whole_again_after_a_step_in_a_smaller_stage() -> None:
         state = pathreplay.step(problem, state)
         assert tuple(scene.sensors()[0].film().size()) == (8, 8)
     executor = next(iter(state._task._known.values()))[1]
-    (recordings,) = executor.evaluate._evaluate._recordings.values()  # type: ignore[attr-defined]
-    assert [each.n_recordings for each in recordings._frozen.values()] == [1]
+    assert times_recorded(executor.evaluate._evaluate) == [1]  # type: ignore[attr-defined]
 
 
 def test_stages_choose_views_and_batches() -> None:

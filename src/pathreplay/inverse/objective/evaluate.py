@@ -7,7 +7,7 @@ of an iteration to evaluators, in this process or in others.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.integrators.camera_pass import Which
 from pathreplay.integrators.film.image import make_ready
 from pathreplay.integrators.lifetimes import plain_errors
 from pathreplay.integrators.scene_facts import facts_of
@@ -47,7 +48,7 @@ LARGE = 2**22
 """Number of entries from which the memory of a variable is managed explicitly (see `release`)."""
 MOST_INPUTS = 4096
 """Maximum number of sensors, times the number of kinds of views. Each kind is recorded, and a recording contains all
-sensors of the scene, about 60 kB per sensor (measured: 3 MB with 50 sensors, 11 MB with 200)."""
+sensors of the scene (measured: 3 MB with 50 sensors, 11 MB with 200)."""
 
 
 @dataclass(frozen=True)
@@ -218,14 +219,14 @@ class Evaluator:
         # A user's loss may contain NumPy arrays. To copy one during a recording ends the process.
         loss = problem.loss not in ELSEWHERE and not isinstance(problem.loss, Own)
         recordable = record and loss and is_recordable(self.integrator, has_media)
-        sensors = SharedSensors(problem, self._moving) if recordable else None
+        sensors = SharedSensors(problem, self._moving, self._reached) if recordable else None
         if sensors is not None and sensors.count * len(problem.scene.sensors()) > MOST_INPUTS:
             sensors = None
         self._sensors = sensors  # None if passes are not recorded
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # Keys: samples per pixel.
         # Whether one pass computes image and gradient. Keys: kind of view (see `SharedSensors`), samples per pixel, and
         # whether pixels are batched.
-        self._sweeps: dict[tuple[Hashable, int, bool], bool] = {}
+        self._sweeps: dict[tuple[Which, int, bool], bool] = {}
         self._learned: Arrays = {}  # State of the integrator after the last evaluation.
         self._at: object = None  # `integrator.baseline` after the last evaluation. Another evaluator may replace it.
         self._begun = False

@@ -6,13 +6,14 @@ differentiation renders one tangent image per entry, with the same random number
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable
+from collections.abc import Collection
 from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.integrators.camera_pass import Which
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.stateful import StatefulIntegrator
 from pathreplay.inverse.objective.frozen import Recordings, RenderRequest, linear_derivative
@@ -44,7 +45,7 @@ class Jacobians:
     ) -> None:
         self.problem, self.integrator, self._sensors = problem, integrator, sensors
         self._recordings = Recordings()
-        self._traced: set[tuple[str, Hashable]] = set()  # pairs of a variable (or IMAGE) and a kind of view
+        self._traced: set[tuple[str, Which]] = set()  # pairs of a variable (or IMAGE) and a kind of view
         self._moving = [v.key for v in problem.variables if v.key in moving]
         self._reached = {key: problem.reached(frozenset({key})) if key != EXPOSURE else set() for key in self._moving}
 
@@ -148,7 +149,7 @@ class Jacobians:
         scene, integrator, run = self.problem.scene, self.integrator, _image if key == IMAGE else _tangent
         state = integrator.begin(scene)
         # The first call is not recorded: see `Evaluator`.
-        kind = view if self._sensors is None else self._sensors.kind(view)
+        kind = request.sensor if self._sensors is None else self._sensors.kind(view)
         if self._sensors is not None and (key, kind) in self._traced:
             request = replace(request, sensor=self._sensors.of(view))
             which = key, request.sensor, request.spp

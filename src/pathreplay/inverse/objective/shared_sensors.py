@@ -29,15 +29,13 @@ class SharedSensors:
     Args:
         problem: the problem.
         moving: variables that are differentiated.
+        reached: indices of the views that these variables affect.
     """
 
-    def __init__(self, problem: Problem, moving: frozenset[str]) -> None:
+    def __init__(self, problem: Problem, moving: frozenset[str], reached: set[int]) -> None:
         self._problem = problem
-        self._shared: dict[Hashable, tuple[mi.Sensor, mi.Sensor]] = {}
-        """The sensor of the first view of each kind, and the shared sensor. They have the same film."""
-        self._kinds: dict[int, Hashable] = {}
-        """Kinds of the views that share a sensor."""
-        reached = problem.reached(moving)
+        self._shared: dict[int, tuple[mi.Sensor, mi.Sensor]] = {}
+        """By view: the sensor of the first view of the same kind, and the shared sensor. They have the same film."""
         moved = {problem.params.properties[key][2] for key in problem.moves(moving)}
         alike: defaultdict[Hashable, list[int]] = defaultdict(list)
         for n, view in problem.trained().items():
@@ -45,27 +43,26 @@ class SharedSensors:
             if sensor not in moved and _is_known(sensor):
                 size = tuple(view.target.shape)  # of the film, once a pass has begun
                 alike[_constants(sensor), size, view.weight is None, n in reached].append(n)
-        for kind, views in alike.items():
+        for views in alike.values():
             if len(views) > 1:
                 first = problem.scene.sensors()[problem.views[views[0]].sensor]
-                self._shared[kind] = first, _like(first)
-                self._kinds |= dict.fromkeys(views, kind)
+                self._shared |= dict.fromkeys(views, (first, _like(first)))
 
     @property
     def count(self) -> int:
         """Number of kinds of training views."""
         return len({self.kind(n) for n in self._problem.trained()})
 
-    def kind(self, view: int) -> Hashable:
-        """Return the kind of a view: what several views have in common, or the index of the view's sensor."""
-        return self._kinds.get(view, self._problem.views[view].sensor)
+    def kind(self, view: int) -> Which:
+        """Return the kind of a view: the shared sensor, or the index of the view's own sensor."""
+        return self._shared[view][1] if view in self._shared else self._problem.views[view].sensor
 
     def of(self, view: int) -> Which:
         """Return the sensor of a recorded pass: the shared sensor with the arrays of the view, or the view's sensor."""
         about = self._problem.views[view]
-        if view not in self._kinds:
+        if view not in self._shared:
             return about.sensor
-        first, shared = self._shared[self._kinds[view]]
+        first, shared = self._shared[view]
         fit_film(first, about.target.shape)  # the update below adapts the shared sensor to the film
         values, params = mi.traverse(self._problem.scene.sensors()[about.sensor]), mi.traverse(shared)
         # If the sensors shared an array, a recording would treat it as a single input.
