@@ -29,6 +29,13 @@ MOST = 4.0
 STEEP = 0.03
 """Angle in radians per unit length of a segment in an emitter's square. It is added to the angle that the segment
 subtends, to bound the importance of small emitters."""
+ON_ARCS = 8.0
+"""Factor of the importance of arcs. The radiance beyond an edge is unknown until the edge is located. The contributions
+of arcs therefore vary more than their importance, and the variance is smaller if more arcs are bisected."""
+VERTICES = 8
+"""Number of vertices of a path that are distinguished. All later vertices count as the last of these."""
+EVENLY = 0.25
+"""Smallest relative weight of a vertex in the selection of observers, because there are few pilot segments."""
 
 
 @dataclass
@@ -68,22 +75,55 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
     return dr.select(observer.separates(a, b), OWN, mi.Float(1))
 
 
-def radiance_of(importances: list[Importance]) -> mi.Float:
-    """Estimate the mean radiance along arcs.
+@dataclass
+class Importances:
+    """Importance of all segments around the observers of several paths."""
 
-    The estimate is the scattered radiance of all emitter samples, divided by the scattering weight of all arcs.
-    """
-    from_emitters, total = (dr.sum(importance.light) for importance in importances)
-    return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
+    squares: Importance  # one segment in the square of emitter samples per path
+    arcs: Importance  # one arc of each path, then a second arc of each path, and so on
+    vertex: mi.UInt32  # number of vertices before the observer of each path, at most `VERTICES` - 1
+    exists: mi.Bool  # whether the path has an observer
+
+    def radiance(self) -> mi.Float:
+        """Estimate the mean radiance along arcs, by the number of vertices before the observer.
+
+        The estimate is the radiance that emitter samples scatter at this and all later vertices, divided by the
+        scattering weight of the arcs. If no observer has this number of preceding vertices, the result is an average.
+        """
+        scattered, weight = self._by_vertex(self.squares.light), self._by_vertex(self.arcs.light)
+        total, onward = dr.sum(scattered), dr.sum(scattered) - dr.cumsum(scattered) + scattered
+        average = dr.select((total > 0) & (dr.sum(weight) > 0), total / dr.sum(weight), 1)
+        return dr.select((onward > 0) & (weight > 0), onward / weight, average)
+
+    def weighed(self, radiance: mi.Float) -> list[mi.Float]:
+        """Return `Importance.presence` and the importance of edges as two arrays. Each of the two arrays has the sum 1.
+
+        In both arrays, the segments in emitter squares precede the arcs. ``radiance`` is the result of `radiance`, for
+        these or for other paths.
+        """
+        on_arcs = ON_ARCS * dr.gather(mi.Float, radiance, _repeated(self.vertex, self.arcs.edges)) * self.arcs.edges
+        presence = dr.concat([self.squares.presence, self.arcs.presence])
+        importance = dr.concat([self.squares.edges, on_arcs])
+        dr.eval(presence, importance)
+        return [x / dr.maximum(dr.sum(x), dr.smallest(mi.Float)) for x in (presence, importance)]
+
+    def shares(self, importance: mi.Float) -> mi.Float:
+        """Return weights for the selection of observers, by the number of preceding vertices: see `choose_vertex`.
+
+        A weight is proportional to the root mean square of the segments' ``importance``, to minimise the variance.
+        """
+        squares, count = self._by_vertex(dr.square(importance)), self._by_vertex(dr.select(self.exists, mi.Float(1), 0))
+        rms = dr.sqrt(squares / dr.maximum(count, 1))
+        largest = dr.max(rms)
+        return dr.select(largest > 0, dr.lerp(rms / largest, 1, EVENLY), 1)
+
+    def _by_vertex(self, x: mi.Float) -> mi.Float:
+        """Sum values of segments by the number of vertices before the observer."""
+        total = dr.zeros(mi.Float, VERTICES)
+        dr.scatter_add(total, x, _repeated(self.vertex, x))
+        return total
 
 
-def weighed(importances: list[Importance], radiance: mi.Float) -> list[mi.Float]:
-    """Return `Importance.presence` and the importance of edges as two arrays. Each of the two arrays has the sum 1.
-
-    In both arrays, the segments in emitter squares precede the arcs.
-    """
-    in_squares, on_arcs = importances
-    presence = dr.concat([in_squares.presence, on_arcs.presence])
-    importance = dr.concat([in_squares.edges, radiance * on_arcs.edges])
-    dr.eval(presence, importance)
-    return [x / dr.maximum(dr.sum(x), dr.smallest(mi.Float)) for x in (presence, importance)]
+def _repeated(x: mi.UInt32, like: mi.Float) -> mi.UInt32:
+    """Repeat the values of all paths, once for each of their segments in ``like``. A single value is broadcast."""
+    return x if dr.width(x) == 1 else dr.concat([x] * (dr.width(like) // dr.width(x)))

@@ -78,9 +78,18 @@ class SelectedVertex:
 
 @dr.syntax
 def choose_vertex(
-    trace: TraceConfig, sampler: CounterSampler, ray: mi.Ray3f, flows: mi.Bool, layout: Layout | None, records: Any
+    trace: TraceConfig,
+    sampler: CounterSampler,
+    ray: mi.Ray3f,
+    flows: mi.Bool,
+    shares: mi.Float,
+    layout: Layout | None,
+    records: Any,
 ) -> tuple[Any, SelectedVertex]:
-    """Trace a camera path, and select one of the vertices that `may_see` an edge, in proportion to the throughput.
+    """Trace a camera path, and select one of the vertices that `may_see` an edge.
+
+    The selection probability is proportional to the throughput and to the vertex's entry in ``shares``. The index of
+    the entry is the number of preceding vertices. Vertices beyond the end of ``shares`` have the last entry.
 
     In lanes with ``flows`` (see `FilmDomain`), the camera ray may move, so that all vertices count as moving. Vertices
     are written to ``records`` unless ``records`` is None. A path with `max_depth` vertices scatters no light at its
@@ -96,11 +105,12 @@ def choose_vertex(
     mass = mi.Float(0)
     count = mi.UInt32(0)
     moves = mi.Bool(flows)
-    while dr.hint(path.active, exclude=[trace, layout], label="pathreplay: choose a vertex"):
+    while dr.hint(path.active, exclude=[trace, layout, shares], label="pathreplay: choose a vertex"):
         choice = sampler.next_1d()
         u, step = path.choose(trace, sampler)
         scatters, w = may_see(trace, path.at, step)
-        m = dr.select(path.active & scatters, dr.mean(dr.abs(path.β * w)), 0)
+        share = dr.gather(mi.Float, shares, dr.minimum(count, len(shares) - 1), path.active)
+        m = dr.select(path.active & scatters, share * dr.mean(dr.abs(path.β * w)), 0)
         mass += m
         moves |= may_move(trace, path.at.hit)
         take = (m > 0) & (choice * mass < m)

@@ -25,7 +25,7 @@ from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
 from pathreplay.boundary.cast_shadows import cast_shadows, casters
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
 from pathreplay.boundary.emitters import EmitterSegment
-from pathreplay.boundary.importance import MOST, UNFORESEEN, Importance, radiance_of, weighed
+from pathreplay.boundary.importance import MOST, UNFORESEEN, VERTICES, Importance, Importances
 from pathreplay.boundary.observer import ObserverVertex, SelectedVertex, choose_vertex
 from pathreplay.boundary.occlusion import ArcSegment
 from pathreplay.boundary.search import EdgeSearch, SegmentDensity, pilot_size
@@ -37,7 +37,7 @@ from pathreplay.transport.vertex import TraceConfig
 UNGUIDED = 0.8
 """Fraction of pilot segments that are not concentrated at cast shadows, because shadows seen in reflections and
 refractions lie at other film positions."""
-ARCS = 4
+ARCS = 8
 """Number of arcs around a vertex with a narrow lobe. Other vertices have one arc: more arcs would take time, and would
 hardly reduce the noise."""
 
@@ -64,14 +64,16 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     """
 
     lengths: tuple[float, float]
-    radiance: mi.Float | None = None  # mean radiance along arcs, estimated by the pilot pass
+    shares: mi.Float  # selection weights of vertices: see `choose_vertex`
+    radiance: mi.Float | None = None  # see `Importances.radiance`; estimated by the pilot pass
 
     bisection = Stream.BISECT_SECONDARY
 
     @staticmethod
     def of(trace: TraceConfig, film: FilmDomain, lengths: tuple[float, float]) -> SecondarySearch:
         trace = replace(trace, max_depth=min(trace.max_depth, deepest(trace)))
-        return SecondarySearch(trace, film, SegmentDensity(int(film.size.x), int(film.size.y), 0.0), lengths)
+        density = SegmentDensity(int(film.size.x), int(film.size.y), 0.0)
+        return SecondarySearch(trace, film, density, lengths, dr.ones(mi.Float, VERTICES))
 
     def guided(self, n: int, seed: mi.UInt32) -> SecondarySearch:
         """Refine the density with a pilot pass (see `EdgeSearch`). Some pilot segments are drawn at cast shadows."""
@@ -82,8 +84,8 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         n_pilot = pilot_size(n, self.film.size)
         pilot = replace(self, density=density).draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.PILOT.of(seed))
         importances = self._importances(pilot)
-        radiance = radiance_of(importances)
-        importance = weighed(importances, radiance)[1]
+        radiance = importances.radiance()
+        importance = importances.weighed(radiance)[1]
         s = mi.Point2f(*(dr.concat([x] * (1 + self.most_arcs)) for x in pilot.s))
         relative_density = dr.concat([pilot.density] * (1 + self.most_arcs)) * (density.width * density.height)
         mean_importance = dr.rcp(
@@ -91,7 +93,10 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         )
         relative = dr.minimum(importance * relative_density / (MOST * mean_importance), 1)
         return replace(
-            self, density=density.refined(s, dr.square(relative) / relative_density, UNGUIDED), radiance=radiance
+            self,
+            density=density.refined(s, dr.square(relative) / relative_density, UNGUIDED),
+            shares=importances.shares(relative),
+            radiance=radiance,
         )
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
@@ -109,7 +114,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     def detect(self, segments: CameraPath) -> mi.Float:
         """Return the importance of all segments in emitter squares, followed by the importance of all arcs."""
         assert self.radiance is not None
-        presence, importance = weighed(self._importances(segments), self.radiance)
+        presence, importance = self._importances(segments).weighed(self.radiance)
         return importance + UNFORESEEN * presence
 
     def resolve(self, segments: CameraPath, weight: mi.Float, generator: mi.PCG32) -> Edges:
@@ -129,7 +134,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         """Select a vertex of each camera path, and record the path unless ``records`` is None."""
         ray, weight = dr.detach(self.film.ray(path.s, path.key))
         sampler, flows = CounterSampler.of(path.key), self.film.flows(path.s)
-        records, x = choose_vertex(self.trace, sampler, ray, flows, layout, records)
+        records, x = choose_vertex(self.trace, sampler, ray, flows, self.shares, layout, records)
         x.β *= weight / path.density
         return records, x
 
@@ -152,21 +157,23 @@ class SecondarySearch(EdgeSearch[CameraPath]):
             key = key_of(number, key)
         return ArcSegment.draw(observer, self.lengths[1], narrow, key, observer.active)
 
-    def _importances(self, path: CameraPath) -> list[Importance]:
-        """Estimate the importance of the segments in emitter squares, and of the arcs."""
+    def _importances(self, path: CameraPath) -> Importances:
+        """Estimate the importance of all segments."""
         _, x = self._vertex(path, None, None)
         observer, n = ObserverVertex(self.trace, x), dr.width(path.key)
         none = dr.zeros(mi.Float, n)
         path.density += none  # broadcast to the number of paths
-        importances = [self._square(observer, path.key).detect()]
+        square = self._square(observer, path.key).detect()
         if self.most_arcs == 1:
-            importances.append(self._arc(observer, path.key, mi.UInt32(1)).detect())
-        importances = [replace(w, presence=w.presence / path.density, edges=w.edges + none) for w in importances]
-        if self.most_arcs > 1:
-            importances.append(Importance(*(dr.zeros(mi.Float, n * self.most_arcs) for _ in fields(Importance))))
-            self._detect_arcs(observer, path, n, importances[1])
-        dr.eval(path.s, path.density, importances)
-        return importances
+            arcs = self._arc(observer, path.key, mi.UInt32(1)).detect()
+            arcs = replace(arcs, presence=arcs.presence / path.density, edges=arcs.edges + none)
+        else:
+            arcs = Importance(*(dr.zeros(mi.Float, n * self.most_arcs) for _ in fields(Importance)))
+            self._detect_arcs(observer, path, n, arcs)
+        square = replace(square, presence=square.presence / path.density, edges=square.edges + none)
+        found = Importances(square, arcs, dr.minimum(x.k, VERTICES - 1), x.active)
+        dr.eval(path.s, path.density, found)
+        return found
 
     @dr.syntax
     def _detect_arcs(self, observer: ObserverVertex, path: CameraPath, n: int, found: Importance) -> None:

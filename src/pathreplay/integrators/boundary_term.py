@@ -27,7 +27,7 @@ from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
-FILM_CLOSER, INNER_CLOSER, NARROW_CLOSER = 5, 16, 8
+FILM_CLOSER, INNER_CLOSER, NARROW_CLOSER = 5, 16, 4
 """Number of segments on the film, and of paths in secondary searches, per bisected segment. If vertices have several
 arcs, `NARROW_CLOSER` replaces `INNER_CLOSER`."""
 GRID = "SDFGrid"
