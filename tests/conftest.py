@@ -38,6 +38,9 @@ COMPUTING = {"test_truth_media", "test_pixel_sweep", "test_replay_attached", "te
              "test_truth_materials", "test_truth_attached", "test_motion_noise", "test_fixed_set", "test_drivers",
              "test_terms", "test_evaluated", "test_step", "test_truth_edges", "test_truth_edges_inner",
              "test_truth_edges_media"}  # fmt: skip
+#: Files whose quick tests have Mitsuba read or write EXR files, or that need two threads.
+READING = {"test_derived", "test_export", "test_particles_in_use", "test_photographs", "test_picture_files",
+           "test_response", "test_stored", "test_views_apart"}  # fmt: skip
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
 TIMEOUT_S = 120
 #: Files that take longest, begun first, so that of several processes none is left alone with one of them.
@@ -106,9 +109,15 @@ def _variant() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def _own_core(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Share the cores among processes that compute side by side: threads that wait for work keep a core from others."""
+    """Share the cores among processes that compute side by side: threads that wait for work keep a core from others.
+
+    Of the time of two processes with two threads each, they took a fifth. With kernels as users have them, threads are
+    mostly as users have them, too.
+    """
     threads, processes = dr.thread_count(), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    if request.module.__name__ not in COMPUTING or processes == 1:
+    name = request.module.__name__
+    alone = name not in READING if unoptimised.is_asked_for() else name in COMPUTING
+    if not alone or processes == 1:
         yield
         return
     dr.set_thread_count(max(1, threads // processes))

@@ -13,8 +13,8 @@ import ctypes
 import os
 from pathlib import Path
 
-#: Options of LLVM: skip every pass that may be skipped, and do not say so.
-OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0")
+#: Options of LLVM: skip every pass that may be skipped, do not say so, and assign registers block by block.
+OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0", "-regalloc=fast", "-optimize-regalloc=false")
 
 
 def is_asked_for() -> bool:
