@@ -111,8 +111,7 @@ def _variant() -> Iterator[None]:
 def _own_core(request: pytest.FixtureRequest) -> Iterator[None]:
     """Share the cores among processes that compute side by side: threads that wait for work keep a core from others.
 
-    Of the time of two processes with two threads each, they took a fifth. With kernels as users have them, threads are
-    mostly as users have them, too.
+    With kernels as users have them, threads are mostly as users have them, too.
     """
     threads, processes = dr.thread_count(), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     name = request.module.__name__

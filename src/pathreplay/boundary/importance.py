@@ -9,6 +9,7 @@ the sky, and `DIM` for any surface.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -36,6 +37,8 @@ VERTICES = 8
 """Number of vertices of a path that are distinguished. All later vertices count as the last of these."""
 EVENLY = 0.25
 """Smallest relative weight of a vertex in the selection of observers, because there are few pilot segments."""
+
+Values = TypeVar("Values", "mi.Float", "mi.UInt32")
 
 
 @dataclass
@@ -91,8 +94,9 @@ class Importances:
         scattering weight of the arcs. If no observer has this number of preceding vertices, the result is an average.
         """
         scattered, weight = self._by_vertex(self.squares.light), self._by_vertex(self.arcs.light)
-        total, onward = dr.sum(scattered), dr.sum(scattered) - dr.cumsum(scattered) + scattered
-        average = dr.select((total > 0) & (dr.sum(weight) > 0), total / dr.sum(weight), 1)
+        total, total_weight = dr.sum(scattered), dr.sum(weight)
+        onward = total - dr.cumsum(scattered) + scattered
+        average = dr.select((total > 0) & (total_weight > 0), total / total_weight, 1)
         return dr.select((onward > 0) & (weight > 0), onward / weight, average)
 
     def weighed(self, radiance: mi.Float) -> list[mi.Float]:
@@ -101,7 +105,7 @@ class Importances:
         In both arrays, the segments in emitter squares precede the arcs. ``radiance`` is the result of `radiance`, for
         these or for other paths.
         """
-        on_arcs = ON_ARCS * dr.gather(mi.Float, radiance, _repeated(self.vertex, self.arcs.edges)) * self.arcs.edges
+        on_arcs = ON_ARCS * dr.gather(mi.Float, radiance, repeated(self.vertex, self.arcs.edges)) * self.arcs.edges
         presence = dr.concat([self.squares.presence, self.arcs.presence])
         importance = dr.concat([self.squares.edges, on_arcs])
         dr.eval(presence, importance)
@@ -120,10 +124,10 @@ class Importances:
     def _by_vertex(self, x: mi.Float) -> mi.Float:
         """Sum values of segments by the number of vertices before the observer."""
         total = dr.zeros(mi.Float, VERTICES)
-        dr.scatter_add(total, x, _repeated(self.vertex, x))
+        dr.scatter_add(total, x, repeated(self.vertex, x))
         return total
 
 
-def _repeated(x: mi.UInt32, like: mi.Float) -> mi.UInt32:
+def repeated(x: Values, like: mi.Float) -> Values:
     """Repeat the values of all paths, once for each of their segments in ``like``. A single value is broadcast."""
     return x if dr.width(x) == 1 else dr.concat([x] * (dr.width(like) // dr.width(x)))

@@ -25,7 +25,7 @@ from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
 from pathreplay.boundary.cast_shadows import cast_shadows, casters
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
 from pathreplay.boundary.emitters import EmitterSegment
-from pathreplay.boundary.importance import MOST, UNFORESEEN, VERTICES, Importance, Importances
+from pathreplay.boundary.importance import MOST, UNFORESEEN, VERTICES, Importance, Importances, repeated
 from pathreplay.boundary.observer import ObserverVertex, SelectedVertex, choose_vertex
 from pathreplay.boundary.occlusion import ArcSegment
 from pathreplay.boundary.search import EdgeSearch, SegmentDensity, pilot_size
@@ -86,8 +86,8 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         importances = self._importances(pilot)
         radiance = importances.radiance()
         importance = importances.weighed(radiance)[1]
-        s = mi.Point2f(*(dr.concat([x] * (1 + self.most_arcs)) for x in pilot.s))
-        relative_density = dr.concat([pilot.density] * (1 + self.most_arcs)) * (density.width * density.height)
+        s = mi.Point2f(*(repeated(x, importance) for x in pilot.s))
+        relative_density = repeated(pilot.density, importance) * (density.width * density.height)
         mean_importance = dr.rcp(
             dr.maximum(dr.sum(dr.select(importance > 0, dr.rcp(relative_density), 0)), dr.smallest(mi.Float))
         )
@@ -163,14 +163,16 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         observer, n = ObserverVertex(self.trace, x), dr.width(path.key)
         none = dr.zeros(mi.Float, n)
         path.density += none  # broadcast to the number of paths
-        square = self._square(observer, path.key).detect()
+
+        def per_path(found: Importance) -> Importance:
+            return replace(found, presence=found.presence / path.density, edges=found.edges + none)
+
+        square = per_path(self._square(observer, path.key).detect())
         if self.most_arcs == 1:
-            arcs = self._arc(observer, path.key, mi.UInt32(1)).detect()
-            arcs = replace(arcs, presence=arcs.presence / path.density, edges=arcs.edges + none)
+            arcs = per_path(self._arc(observer, path.key, mi.UInt32(1)).detect())
         else:
             arcs = Importance(*(dr.zeros(mi.Float, n * self.most_arcs) for _ in fields(Importance)))
             self._detect_arcs(observer, path, n, arcs)
-        square = replace(square, presence=square.presence / path.density, edges=square.edges + none)
         found = Importances(square, arcs, dr.minimum(x.k, VERTICES - 1), x.active)
         dr.eval(path.s, path.density, found)
         return found
