@@ -19,7 +19,7 @@ from pathreplay.boundary.hard_shadows import ShadowTest, sample_light
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
-from pathreplay.transport.motion import may_move
+from pathreplay.transport.motion import may_move, may_turn
 from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import mixed, place_met, shape_met, turned_away
 from pathreplay.transport.start import CameraStart, medium_around
@@ -48,8 +48,8 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
 def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> VisibilityProbe:
     """Probe a path from the camera to its first vertex without a delta lobe.
 
-    Vertices before the first surface that may move are not compared. In lanes with ``flows`` (see `FilmDomain`), the
-    camera ray may move, so that all surfaces count as moving.
+    Vertices before the first surface that may move are not compared, apart from the first (`VisibilityProbe.still`).
+    In lanes with ``flows`` (see `FilmDomain`), the camera ray may move, so that all surfaces count as moving.
     """
     sampler = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
@@ -57,17 +57,23 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
         moved = flows | may_move(trace, path.at.hit)
         return dr.select(moved, _probe_vertex(trace, path, key, active & moved), VisibilityProbe.of())
     probe, moves = VisibilityProbe.of(), mi.Bool(flows)
+    still, first = mi.UInt32(0), mi.Bool(True)
     while dr.hint(path.active, exclude=[trace], label="pathreplay: chain"):
         moves |= may_move(trace, path.at.hit)
         vertex_probe = dr.select(moves, _probe_vertex(trace, path, key, path.active & moves), VisibilityProbe.of())
         if dr.hint(trace.traits.hard_lights, mode="scalar"):
             dark = _shadow_test(trace, path.at, key, path.depth, path.active).dark
             vertex_probe.signature = mixed(vertex_probe.signature, dr.select(dark, mi.UInt32(1), 0))
+        place = place_met(trace, path.at.hit, path.active, shape_met(trace, path.at.hit, path.at.ray, path.active))
         path.active &= _slides(trace, path.at)
         u, step = path.choose(trace, sampler)
         step.active &= step.kept.delta
         lobe = dr.select(step.active, step.kept.lobe + 1, 0)
-        probe = replace(vertex_probe, signature=mixed(mixed(probe.signature, vertex_probe.signature), lobe))
+        signature = mixed(mixed(probe.signature, vertex_probe.signature), lobe)
+        still = dr.select(first & ~moves, mixed(place, lobe) | 1, still)
+        first = mi.Bool(False)
+        probe = replace(vertex_probe, signature=signature, still=still)
+        moves |= may_turn(trace, path.at.hit)
         path = path.advance(trace, u, step)[0]
     return probe
 

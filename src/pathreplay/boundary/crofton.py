@@ -30,6 +30,9 @@ ROUNDING = 1e-5
 HIDES, BENDS = 0.25, 0.02
 """Importance of an edge between two points of one shape, relative to points of two shapes. BENDS applies if each point
 is in front of the other's tangent plane, or each is behind: in most such cases, the surface is merely curved."""
+STILL = 1 / 16
+"""Importance of an edge, relative to other edges, if the first surfaces of two chains are static and differ. Such an
+edge is static, but the same segment may also cross a moving edge."""
 ANGLE = 1e-3
 """Smallest angle between two surfaces, in radians, that counts as an edge."""
 CRACK_BISECTIONS = 8
@@ -59,6 +62,7 @@ class VisibilityProbe:
     triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 1 + index of the visible triangle; 0: none
     light: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the emitter sample, or zero
     lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the BSDF sample, or zero
+    still: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # hash of the first surface; 0 if it may move
 
     @staticmethod
     def of(signature: int | mi.UInt32 | mi.Bool = 0) -> VisibilityProbe:
@@ -75,6 +79,8 @@ class VisibilityProbe:
         bend = dr.dot(self.n, across) * dr.dot(other.n, across) < 0
         same = dr.select(hides_itself(self, other), dr.select(bend, mi.Float(BENDS), HIDES), 0)
         importance = dr.select((self.signature != other.signature) | self._crease(other), 1, same)
+        static = (self.still != 0) & (other.still != 0) & (self.still != other.still)
+        importance *= dr.select(static, mi.Float(STILL), 1)
         return dr.select(self.moves | other.moves, importance, 0)
 
     def _crease(self, other: VisibilityProbe) -> mi.Bool:

@@ -18,7 +18,7 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport import arrive, scatter
 from pathreplay.transport.facts.traits import is_null
 from pathreplay.transport.meet import meet
-from pathreplay.transport.motion import may_move
+from pathreplay.transport.motion import may_move, may_turn
 from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import place_met, shape_met
 from pathreplay.transport.start import CameraStart, behind_emitters
@@ -118,6 +118,7 @@ def choose_vertex(
         chosen = dr.select(
             take, SelectedVertex(path.at, count, path.depth, path.β * w, m, moves, mi.Bool(True), flight), chosen
         )
+        moves |= may_turn(trace, path.at.hit)
         onward, v = path.advance(trace, u, step)
         if dr.hint(records is not None, mode="scalar"):
             assert layout is not None

@@ -91,7 +91,8 @@ class Boundary(Term):
         """
         if trace.media is not None or trace.traits.moving is not None:
             return trace
-        return replace(trace, traits=replace(trace.traits, moving=moving_shapes(trace.scene, _still_cameras(view))))
+        moving, turning = moving_shapes(trace.scene, _still_cameras(view))
+        return replace(trace, traits=replace(trace.traits, moving=moving, turning=turning))
 
     @staticmethod
     def obstacle(view: Pass) -> str:

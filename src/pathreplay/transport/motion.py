@@ -25,22 +25,29 @@ FEW = 8
 COPIES = frozenset({"Instance", "ShapeGroup"})
 
 
-def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Shape, ...] | None:
-    """Find the shapes that have gradients themselves or in a child object, such as a BSDF.
+def moving_shapes(
+    scene: mi.Scene, still: Collection[mi.Object]
+) -> tuple[tuple[mi.Shape, ...] | None, tuple[mi.Shape, ...]]:
+    """Find the shapes that have gradients themselves, and the shapes that have gradients in a child object only.
 
-    Returns None, which means that everything may move, if gradients exist outside the shapes, in an instance or shape
-    group, or in more than `FEW` shapes. Gradients of the objects in ``still`` are ignored, because the caller knows
-    that these objects do not move.
+    The surfaces of the latter do not move. If the child object is a BSDF, the rays that continue from the surface may
+    move. The first result is None, which means that everything may move, if gradients exist outside the shapes, in an
+    instance or shape group, or in more than `FEW` shapes. Gradients of the objects in ``still`` are ignored, because
+    the caller knows that these objects do not move.
     """
     params = mi.traverse(scene)
     with dr.resume_grad():
         attached = {params.properties[key][2] for key, value in known_values(params) if dr.grad_enabled(value)}
     attached.difference_update(still)
     shapes = {shape: nodes_of(shape) | {shape} for shape in scene.shapes()}
-    moving = tuple(shape for shape, nodes in shapes.items() if not attached.isdisjoint(nodes))
-    rest = attached.difference(*(shapes[shape] for shape in moving))
-    copies = any(shape.class_name() in COPIES for shape in moving)
-    return None if rest or copies or len(moving) > FEW else moving
+    found = [shape for shape, nodes in shapes.items() if not attached.isdisjoint(nodes)]
+    rest = attached.difference(*(shapes[shape] for shape in found))
+    copies = any(shape.class_name() in COPIES for shape in found)
+    if rest or copies or len(found) > FEW:
+        return None, ()
+    return tuple(shape for shape in found if shape in attached), tuple(
+        shape for shape in found if shape not in attached
+    )
 
 
 def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
@@ -49,12 +56,19 @@ def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
     If `moving_shapes` returned None, the result is True in all lanes, including misses.
     """
     moving = trace.traits.moving
-    if moving is None:
-        return mi.Bool(True)
-    moves = mi.Bool(False)
-    for shape in moving:
-        moves |= hit.shape == mi.ShapePtr(shape)
-    return moves & hit.is_valid()
+    return mi.Bool(True) if moving is None else _is_one_of(moving, hit)
+
+
+def may_turn(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+    """Return the lanes in which the surface that was hit does not move, but rays that continue from it may move."""
+    return _is_one_of(trace.traits.turning, hit)
+
+
+def _is_one_of(shapes: tuple[mi.Shape, ...], hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+    found = mi.Bool(False)
+    for shape in shapes:
+        found |= hit.shape == mi.ShapePtr(shape)
+    return found & hit.is_valid()
 
 
 def path_moves(trace: TraceConfig, start: Start, at: Arrival) -> bool:

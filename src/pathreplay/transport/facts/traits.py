@@ -91,6 +91,7 @@ class Traits:
     tables_move: bool = False  # the alpha or eta of a `roughplastic`, from which Mitsuba computes tables
     lights_vary: bool = False  # any parameter of an emitter, or of an emissive shape
     moving: tuple[mi.Shape, ...] | None = None  # shapes that may move; None: all shapes and the camera
+    turning: tuple[mi.Shape, ...] = ()  # static shapes whose BSDF has gradients: rays that continue there may move
 
 
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
