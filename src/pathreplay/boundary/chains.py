@@ -57,21 +57,20 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
         moved = flows | may_move(trace, path.at.hit)
         return dr.select(moved, _probe_vertex(trace, path, key, active & moved), VisibilityProbe.of())
     probe, moves = VisibilityProbe.of(), mi.Bool(flows)
-    still, first = mi.UInt32(0), mi.Bool(True)
+    shape = shape_met(trace, path.at.hit, path.at.ray, path.active)
+    first, still = place_met(trace, path.at.hit, path.active, shape), mi.UInt32(0)
     while dr.hint(path.active, exclude=[trace], label="pathreplay: chain"):
         moves |= may_move(trace, path.at.hit)
         vertex_probe = dr.select(moves, _probe_vertex(trace, path, key, path.active & moves), VisibilityProbe.of())
         if dr.hint(trace.traits.hard_lights, mode="scalar"):
             dark = _shadow_test(trace, path.at, key, path.depth, path.active).dark
             vertex_probe.signature = mixed(vertex_probe.signature, dr.select(dark, mi.UInt32(1), 0))
-        place = place_met(trace, path.at.hit, path.active, shape_met(trace, path.at.hit, path.at.ray, path.active))
         path.active &= _slides(trace, path.at)
         u, step = path.choose(trace, sampler)
         step.active &= step.kept.delta
         lobe = dr.select(step.active, step.kept.lobe + 1, 0)
         signature = mixed(mixed(probe.signature, vertex_probe.signature), lobe)
-        still = dr.select(first & ~moves, mixed(place, lobe) | 1, still)
-        first = mi.Bool(False)
+        still = dr.select((path.depth == 0) & ~moves, mixed(first, lobe) | 1, still)
         probe = replace(vertex_probe, signature=signature, still=still)
         moves |= may_turn(trace, path.at.hit)
         path = path.advance(trace, u, step)[0]

@@ -45,9 +45,8 @@ def moving_shapes(
     copies = any(shape.class_name() in COPIES for shape in found)
     if rest or copies or len(found) > FEW:
         return None, ()
-    return tuple(shape for shape in found if shape in attached), tuple(
-        shape for shape in found if shape not in attached
-    )
+    moving = tuple(shape for shape in found if shape in attached)
+    return moving, tuple(shape for shape in found if shape not in moving)
 
 
 def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
