@@ -20,7 +20,7 @@ from pathreplay.boundary.chains import transmittance_of_chain
 from pathreplay.boundary.crofton import BEYOND, BISECTIONS, PlaneSegment, VisibilityProbe, bisect, detect, heading
 from pathreplay.boundary.emitters import BORDER, sample_at
 from pathreplay.boundary.observer import ObserverVertex
-from pathreplay.boundary.primary import PrimarySearch
+from pathreplay.boundary.primary import FilmCrossing, PrimarySearch
 from pathreplay.boundary.search import Resampled, SegmentDensity
 from pathreplay.boundary.volumetric import VolumetricSearch
 from pathreplay.integrators.boundary_term import INNER_LENGTHS
@@ -319,6 +319,29 @@ def test_a_medium_out_of_view_takes_no_edges_from_a_large_film() -> None:
     # two searches do not resample the same crossings.
     assert [(found > 0).mean() > 0.998 for found in weights] == [True, True]
     assert weights[1].sum() == pytest.approx(weights[0].sum(), rel=1e-2)
+
+
+def test_hard_shadows_on_large_films_lose_no_edges() -> None:
+    """The two sides of an edge are so close there that a shadow ray of each could end on the same side of the ball."""
+    eye = camera((0, 0, 5), 40)
+    eye["film"] = {**eye["film"], "width": 1024, "height": 1024}
+    parts = {
+        "floor": {"type": "rectangle", "to_world": scenes.T().scale(3)},
+        "ball": {"type": "sphere", "center": [0, 0, 1], "radius": 0.3},
+        "light": {"type": "point", "position": [1, 0.5, 3]},
+    }
+    scene, integrator = mi.load_dict({"type": "scene", "eye": eye, **parts}), mi.load_dict({"type": "pathreplay"})
+    with careful(), dr.suspend_grad():
+        view = Pass.of(scene, 0, 0, 1)
+        trace = integrator._trace_config(scene, view.sensor)
+        edges = PrimarySearch.of(trace, FilmPlaces.of(view), 0.5).find(2**16, 8000, mi.UInt32(1))
+        crossing = edges.crossings[0]
+        assert isinstance(crossing, FilmCrossing) and crossing.crease.shadow is not None
+        on_floor = crossing.active & crossing.crease.shadow.exists
+        on_floor &= crossing.near.hit.shape == mi.ShapePtr(next(s for s in scene.shapes() if s.id() == "floor"))
+    weights = np.array(crossing.weight)[0][np.array(on_floor)]
+    assert len(weights) > 1000
+    assert (weights == 0).mean() < 1e-3  # it was zero for half of them
 
 
 def test_the_cone_around_a_mesh_lamp_follows_it() -> None:

@@ -12,11 +12,13 @@ import mitsuba as mi
 
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.samplers.streams import Stream
+from pathreplay.transport import arrive, scatter
 from pathreplay.transport.emitters import draw_emitter
 from pathreplay.transport.meet import meet
 from pathreplay.transport.signature import edge_normal, outline_gap
-from pathreplay.transport.vertex import Arrival, TraceConfig, VertexSamples, is_smooth
-from pathreplay.transport.volume.passage import skip_null
+from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexSamples, is_smooth
+from pathreplay.transport.volume.passage import skip_null, transmittance_past_edge
 
 
 @dataclass
@@ -77,13 +79,29 @@ class HardShadow:
     exists: mi.Bool
     in_a: mi.Bool  # the first point is dark
     test: ShadowTest  # test of the dark point
+    lit: ShadowTest  # test of the other point
     n: mi.Vector3f  # normal to the edge of the occluder: see `edge_normal`
 
     @staticmethod
     def between(trace: TraceConfig, a: ShadowTest, b: ShadowTest, active: mi.Bool) -> HardShadow:
         """Compare two shadow tests. The result is detached."""
-        exists, test = active & (a.dark != b.dark), dr.select(a.dark, a, b)
-        return HardShadow(trace, exists, a.dark, test, edge_normal(test.hit, test.ray, exists & ~test.outside))
+        exists, (test, lit) = active & (a.dark != b.dark), (dr.select(a.dark, x, y) for x, y in ((a, b), (b, a)))
+        return HardShadow(trace, exists, a.dark, test, lit, edge_normal(test.hit, test.ray, exists & ~test.outside))
+
+    def scattered(self, trace: TraceConfig, at: Arrival, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        """Return the light of the sampled emitter that the lit point scatters back along its path. Detached.
+
+        ``at`` is the arrival at the lit point. The ``key`` determines the random numbers of the path.
+        """
+        active, sampler = active & self.exists, CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_BEAM)
+        flight = None if trace.media is None else Flight.none(trace.media)
+        v = arrive.choose(trace, at, sampler, mi.Spectrum(1), active, flight)
+        L = scatter.towards(v, mi.BSDFContext(), self.lit.ray.d, active)[0] * self.lit.Le
+        if trace.media is not None:
+            ray, turns = self.lit.ray, v.surface & v.si.is_medium_transition()
+            medium = dr.select(turns, v.si.target_medium(ray.d), at.medium)
+            L *= transmittance_past_edge(trace, ray, self.test.hit.t, medium, sampler, active)
+        return dr.select(active, L, 0)
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """Evaluate B, which is zero on the shadow boundary, at the hit of ``ray``.

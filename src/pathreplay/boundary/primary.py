@@ -101,12 +101,12 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         (ray_a, weight), (ray_b, _) = (self.film.ray(s, key) for s in ends)
         split = split_chains(self.chain, (ray_a, ray_b), key, active)
         active = active & split.parted
-        jump = weight * split.β * self._jump(split, ray_a, key, active)
-
         near_a, shadow = split.a.hit.t <= split.b.hit.t, None
         if split.shadows is not None:
             shadow = HardShadow.between(self.chain, split.shadows[0], split.shadows[1], active)
             near_a = dr.select(shadow.exists, shadow.in_a, near_a)
+        jump = weight * split.β * self._jump(split, shadow, ray_a, key, active)
+
         near, s = dr.select(near_a, split.a, split.b), dr.select(near_a, *ends)
         active = active & near.hit.is_valid()
         n = edge_normal(near.hit, near.ray, active)
@@ -114,8 +114,15 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         path, active = record_chain(self.chain, s, self.film.ray(s, key)[0], key, split.k, near.ray, active)
         return Edges(path, [FilmCrossing(dr.select(active, jump, 0), near, n, crease, active)], None)
 
-    def _jump(self, split: ChainSplit, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
-        """Estimate f_a - f_b with the same random numbers on both sides. ``ray`` is the camera ray of side a."""
+    def _jump(
+        self, split: ChainSplit, shadow: HardShadow | None, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool
+    ) -> mi.Spectrum:
+        """Estimate f_a - f_b. ``ray`` is the camera ray of side a.
+
+        At the boundary of a hard shadow, this is the scattered light of the sampled emitter. The emitter is not tested
+        again for visibility: the two sides are so close that rounding would decide the test. At other edges, f_a and
+        f_b are estimated with the same random numbers.
+        """
         trace = self.trace
         # On coarse meshes, a triangle occludes the part of a lobe that lies below its plane. `steady` makes the shading
         # frames continuous across triangles, so that only this occlusion differs between the two sides of a crease.
@@ -126,11 +133,15 @@ class PrimarySearch(FilmSearch[FilmSegment]):
             T, medium = transmittance_of_chain(trace, ray, key, split.k, t, active)
             active = active & dr.any(T != 0)
             sides = [arrival_beyond(trace, side, t, medium, active) for side in sides]
-        f = []
+        f, sampled = [], active if shadow is None else active & ~shadow.exists
         for side in sides:
-            path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(split.k), mi.Bool(active))
+            path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(split.k), mi.Bool(sampled))
             f.append(path_radiance(onward, CounterSampler.at_vertex(key, split.k), path)[0])
-        return T * (f[0] - f[1])
+        jump = f[0] - f[1]
+        if shadow is not None:
+            L = shadow.scattered(onward, dr.select(shadow.in_a, sides[1], sides[0]), key, active)
+            jump = dr.select(shadow.exists, dr.select(shadow.in_a, -L, L), jump)
+        return T * jump
 
     def slope(self, segment: FilmSegment, edges: Edges) -> mi.Vector2f:
         path, (crossing,) = edges.path, edges.crossings

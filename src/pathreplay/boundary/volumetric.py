@@ -97,11 +97,10 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
     def edge(self, segment: BeamSegment, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
         (visible_a, test_a), (visible_b, test_b) = (self._shadow_test(segment, t, active) for t in (a, b))
         shadow = HardShadow.between(self.trace, test_a, test_b, active & visible_a & visible_b)
-        lit_test = dr.select(shadow.in_a, test_b, test_a)
         s = segment.at(dr.select(shadow.in_a, a, b))
         ray, weight = dr.detach(self.film.ray(s, segment.key))
-        path, observer = self._particle(s, ray, segment, shadow.exists & lit_test.lit)
-        jump = weight * dr.select(shadow.in_a, -1, 1) * self._radiance(ray, segment, observer, shadow, lit_test)
+        path, observer = self._particle(s, ray, segment, shadow.exists & shadow.lit.lit)
+        jump = weight * dr.select(shadow.in_a, -1, 1) * self._radiance(ray, segment, observer, shadow)
         return Edges(path, [BeamCrossing(dr.select(observer.active, jump, 0), shadow, observer.active)], observer)
 
     def slope(self, segment: BeamSegment, edges: Edges) -> mi.Vector2f:
@@ -109,7 +108,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         return derivative_by_place(path.s, lambda s: crossing.gap(_point_on(self.film.ray(s, path.key)[0], segment.τ)))
 
     def _radiance(
-        self, ray: mi.Ray3f, segment: BeamSegment, observer: ObserverVertex, shadow: HardShadow, lit_test: ShadowTest
+        self, ray: mi.Ray3f, segment: BeamSegment, observer: ObserverVertex, shadow: HardShadow
     ) -> mi.Spectrum:
         """Estimate f, the radiance that the lit medium point scatters to the camera.
 
@@ -119,6 +118,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         active = observer.active & observer.at.medium.use_emitter_sampling() & (trace.max_depth > 1)
         sampler = CounterSampler.stream(segment.key, Stream.TRANSMITTANCE_OF_BEAM)
         T = transmittance_up_to(trace, ray, segment.τ, medium_around(trace), sampler, active)[0]
+        lit_test = shadow.lit
         T *= transmittance_past_edge(trace, lit_test.ray, shadow.test.hit.t, observer.at.medium, sampler, active)
         f = T * observer.selected.β * observer.towards(lit_test.ray.d, active)[0] * lit_test.Le
         return dr.select(active, f, 0)
