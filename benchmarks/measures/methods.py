@@ -28,7 +28,7 @@ METHODS: dict[str, dict[str, object]] = {
     "sobol": {"type": "pathreplay"},
     "no branch": {"type": "pathreplay", "null_branching": False, "sampling": "scene"},
     "listing": {"type": "prb_volume_listing"},
-    "particles": {"type": "pathreplay_particles"},
+    "particles": {"type": "pathreplay_particles", "boundary": "none"},
     "ptracer": {"type": "ptracer"},
 }
 

@@ -1,8 +1,8 @@
 """Gradients of light paths against finite differences, with equal random numbers and in expectation.
 
-Nothing that moves in these scenes has an outline or a crease in the light, so that the derivative at fixed visibility
-is the whole derivative. With equal random numbers, the gradient of every image equals a central difference, where no
-random choice depends on the parameter. Run with -s to see the figures as tables.
+Apart from the cells of `EDGES`, nothing that moves in these scenes has an outline or a crease in the light, so that the
+derivative at fixed visibility is the whole derivative. With equal random numbers, the gradient of every image equals a
+central difference, where no random choice depends on the parameter. Run with -s to see the figures as tables.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import gc
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from particle_scenes import ROUGH, dome, mirror, plane, slab
+from particle_scenes import ROUGH, dome, mirror, plane, rgb, sensor, slab
 from pathreplay.platform import compat
 from pathreplay.testing.objective import Move, Objective, smooth_weights
 from pathreplay.testing.statistics import gap
@@ -131,8 +131,8 @@ def opened(cell: Cell) -> Iterator[Objective]:
 
 
 def integrator(cell: Cell, plugin: str = PLUGIN, **options: Any) -> mi.Integrator:
-    own = {"boundary": "none"} if plugin.startswith("pathreplay") else {}
-    return mi.load_dict({"type": plugin, "max_depth": cell.depth, **own, **cell.options, **options})
+    own = {"boundary": "none", **cell.options} if plugin.startswith("pathreplay") else {}
+    return mi.load_dict({"type": plugin, "max_depth": cell.depth, **own, **options})
 
 
 # ------------------------------ Equal random numbers ------------------------------
@@ -192,6 +192,7 @@ class Mean(Cell):
     reference: str = "path"
     rr_depth: int = 5
     seeds: int = 12
+    peer: str = "ptracer"  # the integrator whose gradient is printed beside ours
 
 
 def mean(name: str, scene: Callable[[], dict], key: str, move: Move, **more: Any) -> Mean:
@@ -222,22 +223,22 @@ MEANS = (
 MEANS_BY_NAME = {c.name: c for c in MEANS}
 
 
-def in_expectation(cell: Mean) -> tuple[float, float]:
-    """Print a row of the table with `ptracer` beside us; return our z, and our standard error over the gradient."""
+def in_expectation(cell: Mean, plugin: str = PLUGIN) -> tuple[float, float]:
+    """Print a row of the table with a peer beside us; return our z, and our standard error over the gradient."""
     with opened(cell) as objective:
         plain = integrator(cell, cell.reference, rr_depth=1000)
         differences, gradients, theirs = np.array([
             [
                 objective.dot(objective.difference(plain, CENTRAL, cell.step, 1000 + seed, cell.spp)),
-                objective.backward(integrator(cell, rr_depth=cell.rr_depth), seed, cell.spp),
-                objective.backward(integrator(cell, "ptracer", rr_depth=cell.rr_depth), seed, cell.spp),
+                objective.backward(integrator(cell, plugin, rr_depth=cell.rr_depth), seed, cell.spp),
+                objective.backward(integrator(cell, cell.peer, rr_depth=cell.rr_depth), seed, cell.spp),
             ]
             for seed in range(1, cell.seeds + 1)
         ]).T  # fmt: skip
     ours, other = gap(gradients, differences), gap(theirs, differences)
     print(
         f"{cell.name:22s} {differences.mean():+11.4e}  ours {gradients.mean():+11.4e} ± {ours.error:7.1e}"
-        f" z {ours.z:+6.2f}  ptracer {theirs.mean():+11.4e} ± {other.error:7.1e} z {other.z:+7.2f}",
+        f" z {ours.z:+6.2f}  {cell.peer} {theirs.mean():+11.4e} ± {other.error:7.1e} z {other.z:+7.2f}",
         flush=True,
     )
     return float(ours.z), float(ours.error / max(abs(differences.mean()), abs(gradients.mean())))
@@ -266,22 +267,135 @@ def lens() -> dict:
     return scene
 
 
+def lit_by(light: str, center: list[float] = [0.1, 0.1, -1.0], **more: dict) -> dict:  # noqa: B006 (only read)
+    """The floor and a black ball under a light, without the slab."""
+    T = mi.ScalarTransform4f
+    look = T().look_at([0.3, 0.2, 1.2], [0, 0, -2], [0, 1, 0])
+    lights = {
+        "point": {"type": "point", "position": [0.3, 0.2, 0.5], "intensity": rgb(9, 7, 5)},
+        "spot": {"type": "spot", "to_world": look, "cutoff_angle": 30.0, "intensity": rgb(30, 25, 20)},
+        "area": {
+            "type": "rectangle", "to_world": look @ T().scale(0.3),
+            "emitter": {"type": "area", "radiance": rgb(14, 11, 8)},
+        },
+        "directional": {"type": "directional", "direction": [0.2, 0.1, -1], "irradiance": rgb(3, 2, 1)},
+        "beam": {
+            "type": "rectangle", "to_world": look @ T().scale(0.8),
+            "emitter": {"type": "directionalarea", "radiance": rgb(3, 2, 1)},
+        },
+    }  # fmt: skip
+    scene = with_ball(center, 0.25, BLACK, light=lights[light], **more)
+    del scene["top"], scene["bottom"]
+    return scene
+
+
+def sideways_eye(kind: str) -> dict:
+    """The camera of `slab`, of another kind."""
+    return sensor(kind, look=mi.ScalarTransform4f().look_at([2.4, 0, -0.8], [0, 0, -2], [0, 0, 1]))
+
+
+def small_floor() -> dict:
+    """The slab, and a floor whose border the light meets."""
+    T = mi.ScalarTransform4f
+    scene = slab()
+    scene["floor"]["to_world"] = T().translate([0, 0, -2]) @ T().scale(0.5)
+    return scene
+
+
+def cube_in_light() -> dict:
+    """A turned cube in the light of a lamp."""
+    T = mi.ScalarTransform4f
+    turned = T().translate([0.1, 0.1, -1]) @ T().rotate([1, 1, 0], 40) @ T().scale(0.18)
+    return {**lit_by("point"), "ball": {"type": "cube", "to_world": turned, "bsdf": BLACK}}
+
+
+def shift(value: Any, t: Any) -> Any:
+    """All vertices of a mesh, moved sideways."""
+    sideways = np.tile(np.float32([0.3, 0.7, 0]), len(np.array(value)) // 3)
+    return value + t * mi.Float(sideways)
+
+
 BLACK = {"type": "diffuse", "reflectance": 0.0}
 SIDEWAYS = translate(0.3, 0.7, 0)
-ball: Callable[..., Mean] = partial(mean, move=SIDEWAYS, depth=6, spp=1024, step=2e-2, **OWN)
-MISSING = (
-    ball("blocker in the caustic", lambda: with_ball([0.1, 0.1, -1.2], 0.12, BLACK), "ball.to_world"),
-    ball("blocker before the slab", lambda: with_ball([0.1, 0.1, 1.2], 0.12, BLACK), "ball.to_world"),
-    ball("blocker before the camera", lambda: with_ball([1.2, 0.05, -1.35], 0.12, BLACK), "ball.to_world"),
+IN_CAUSTIC, BEFORE_EYE = [0.1, 0.1, -1.2], [1.2, 0.05, -1.35]
+edge: Callable[..., Mean] = partial(mean, spp=1024, step=2e-2, options={"boundary": "all"})
+ball: Callable[..., Mean] = partial(edge, key="ball.to_world", move=SIDEWAYS, depth=6, **OWN)
+once: Callable[..., Mean] = partial(edge, key="ball.to_world", move=SIDEWAYS, depth=2)
+BLOCKERS = (
+    ball("blocker in the caustic", lambda: with_ball(IN_CAUSTIC, 0.12, BLACK)),
+    ball("blocker before the slab", lambda: with_ball([0.1, 0.1, 1.2], 0.12, BLACK), step=1e-2),
+    ball("blocker before the camera", lambda: with_ball(BEFORE_EYE, 0.12, BLACK)),
 )
-GRAZED = ball("outline of a glass ball", lens, "ball.to_world")
+EDGES = (
+    *BLOCKERS,
+    edge("index, blocker", lambda: with_ball(IN_CAUSTIC, 0.12, BLACK), "top.bsdf.eta", add(), depth=4, **OWN),
+    edge(
+        "heights, blocker",
+        lambda: with_ball(IN_CAUSTIC, 0.12, BLACK),
+        "top.vertex_positions",
+        waves,
+        depth=4,
+        **{**OWN, "step": 1e-2},
+    ),
+    edge(
+        "spot, blocker",
+        lambda: with_ball(IN_CAUSTIC, 0.12, BLACK),
+        "light.to_world",
+        translate(0.3, 0, 0.1),
+        depth=4,
+        **{**OWN, "step": 1e-2},
+    ),
+    edge(
+        "camera, blocker",
+        lambda: with_ball(BEFORE_EYE, 0.12, BLACK),
+        "sensor.to_world",
+        translate(0.3, 0.7, 0.2),
+        depth=4,
+        **{**OWN, "step": 1e-2},
+    ),
+    edge("border of the floor", small_floor, "floor.to_world", SIDEWAYS, depth=4, **{**OWN, "step": 1e-2}),
+    once("ball, point", partial(lit_by, "point")),
+    once("ball, spot", partial(lit_by, "spot")),
+    once("ball, area", partial(lit_by, "area")),
+    once("ball, directional", partial(lit_by, "directional")),
+    once("ball, beam", partial(lit_by, "beam"), **OWN),
+    once("cube, point", cube_in_light, key="ball.vertex_positions", move=shift),
+    once(
+        "ball, orthographic",
+        partial(lit_by, "spot", BEFORE_EYE, sensor=sideways_eye("orthographic")),
+        peer="prb",
+        **OWN,
+    ),
+    once("ball, thin lens", partial(lit_by, "spot", BEFORE_EYE, sensor=sideways_eye("thinlens")), spp=4096),
+    once("area moves", partial(lit_by, "area"), key="light.to_world", move=translate(0.3, 0.5, 0.2)),
+    once("floor moves", partial(lit_by, "point", [0.1, 0.1, -1.9]), key="floor.to_world", move=translate(0, 0, 0.5)),
+)
+GRAZED = ball("outline of a glass ball", lens)
+
+
+def test_a_shadow_in_the_light_is_in_the_gradient() -> None:
+    (cell,) = (c for c in EDGES if c.name == "floor moves")
+    z, error = in_expectation(replace(cell, seeds=4, spp=512))
+    assert abs(z) < Z_LIMIT and error < RESOLUTION
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cell", MISSING, ids=lambda c: c.name)
-def test_table_of_edges_that_light_paths_leave_out(cell: Mean) -> None:
-    z, _ = in_expectation(cell)
-    assert abs(z) > Z_LIMIT, "this edge is in the gradient now: move the cell, and the row of docs/particles.md"
+@pytest.mark.parametrize("cell", EDGES, ids=lambda c: c.name)
+def test_edges_that_light_meets_are_in_the_gradient(cell: Mean) -> None:
+    z, error = in_expectation(cell)
+    assert abs(z) < Z_LIMIT and error < RESOLUTION
+    with opened(cell) as objective:
+        same = integrator(cell)
+        assert objective.transpose_error(same, same, 1, 64) < TRANSPOSE_MAX
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", BLOCKERS, ids=lambda c: c.name)
+def test_edges_of_caustics_and_of_all_other_light_add_up(cell: Mean) -> None:
+    """Camera paths see the blocker before the floor, and light paths see it in the caustic."""
+    split = replace(cell, reference="pathreplay", options={"boundary": "all", "caustics": "particles"})
+    z, error = in_expectation(split, "pathreplay")
+    assert abs(z) < Z_LIMIT and error < RESOLUTION
 
 
 @pytest.mark.slow

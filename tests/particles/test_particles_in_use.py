@@ -282,6 +282,43 @@ def test_colours_on_a_film_with_a_box_filter_are_told_nothing(log: list[str]) ->
     assert not log
 
 
+@pytest.mark.parametrize(
+    ("plugin", "more", "left_out"),
+    [
+        (PARTICLES, {}, "moving edges"),
+        (PARTICLES, {"boundary": "all"}, "edges that light meets after its first rough surface"),
+        (PARTICLES, {"boundary": "all", "max_depth": 2}, ""),
+        (CAUSTICS, {"boundary": "primary"}, "moving edges"),
+        (CAUSTICS, {"boundary": "auto"}, "edges that light meets after its first rough surface"),
+    ],
+)
+def test_edges_that_light_paths_leave_out_are_told(plugin: dict, more: dict, left_out: str, log: list[str]) -> None:
+    gradient(loaded(balls("glass", light="point")), {**plugin, **more}, "light.position", 4)
+    told = [line for line in log if "the gradient of light paths leaves out" in line]
+    assert len(told) == bool(left_out), log
+    assert all(f"'light.position' moves, and the gradient of light paths leaves out {left_out}: " in t for t in told)
+
+
+def test_edges_in_the_light_of_a_projector_are_told(log: list[str]) -> None:
+    scene = loaded(balls("glass", light="projector"))
+    gradient(scene, {**PARTICLES, "boundary": "all", "max_depth": 2}, "light.to_world", 4)
+    assert any("leaves out edges in the light of emitter 'light': " in line for line in log), log
+
+
+def test_a_shape_of_distances_has_no_boundary_term(log: list[str]) -> None:
+    """As for camera paths: it is left out by default, and refused on request."""
+    scene = balls("glass", light="point")
+    scene["grid"] = {
+        "type": "sdfgrid",
+        "grid": mi.TensorXf(np.linspace(-1, 1, 8, dtype=np.float32).reshape(2, 2, 2, 1)),
+    }
+    made = loaded(scene)
+    gradient(made, {**PARTICLES, "boundary": "auto"}, "light.position", 4)
+    assert any("edges of shape 'grid' of type 'sdfgrid' cannot be differentiated" in line for line in log), log
+    with pytest.raises(PathreplayError, match="edges of shape 'grid' of type 'sdfgrid' cannot be differentiated"):
+        gradient(made, {**PARTICLES, "boundary": "all"}, "light.position", 4)
+
+
 def test_pixel_sweeps_are_refused_with_the_remedy() -> None:
     scene = loaded(balls("glass"))
     caustics, everything = mi.load_dict({**CAUSTICS, "adjoint": "recorded"}), mi.load_dict(PARTICLES)
@@ -413,6 +450,17 @@ def test_recorded_steps_are_traced_steps(plugin: dict) -> None:
     config = job(plugin, iterations=4)
     made = build_problem(config, Path.cwd())
     np.testing.assert_allclose(steps(made, config, "recorded"), steps(made, config, "traced"), rtol=1e-4)
+
+
+def test_recorded_steps_with_edges_are_traced_steps() -> None:
+    """Edges that the camera sees, and edges that the light of the caustic meets."""
+    lamp = {
+        "parameters": [{"key": "lamp.position", "initial": [0.3, 3, 0]}],
+        "target": {"values": {"lamp.position": [0.4, 2.9, 0.1]}, "spp": 16},
+    }
+    config = job({**CAUSTICS, "boundary": "all"}, iterations=4, **lamp)
+    made = build_problem(config, Path.cwd())
+    np.testing.assert_allclose(steps(made, config, "recorded"), steps(made, config, "traced"), rtol=1e-3)
 
 
 INFINITE = {

@@ -40,8 +40,14 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
     left out, because they do not deflect chains. Their transmittance is a separate factor: see
     `transmittance_of_chain`.
     """
-    chain = replace(trace, rr_depth=NEVER, max_depth=min(trace.max_depth, MAX_CHAIN))
+    link = None if trace.to_sensor is None else replace(trace.to_sensor, adjoint=None)
+    chain = replace(trace, rr_depth=NEVER, max_depth=min(trace.max_depth, MAX_CHAIN), to_sensor=link)
     return chain if trace.media is None else replace(chain, media=None, skips_null=True)  # type: ignore[arg-type]
+
+
+def tests_shadows(trace: TraceConfig) -> bool:
+    """Return whether visibility is tested at the vertices of a chain: of hard lights or, on light paths, the sensor."""
+    return trace.to_sensor is not None or trace.traits.hard_lights
 
 
 @dr.syntax
@@ -53,7 +59,7 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
     """
     sampler = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
-    if dr.hint(not (trace.traits.mirrors or trace.traits.hard_lights), mode="scalar"):
+    if dr.hint(not (trace.traits.mirrors or tests_shadows(trace)), mode="scalar"):
         moved = flows | may_move(trace, path.at.hit)
         return dr.select(moved, _probe_vertex(trace, path, key, active & moved), VisibilityProbe.of())
     probe, moves = VisibilityProbe.of(), mi.Bool(flows)
@@ -62,7 +68,7 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
     while dr.hint(path.active, exclude=[trace], label="pathreplay: chain"):
         moves |= may_move(trace, path.at.hit)
         vertex_probe = dr.select(moves, _probe_vertex(trace, path, key, path.active & moves), VisibilityProbe.of())
-        if dr.hint(trace.traits.hard_lights, mode="scalar"):
+        if dr.hint(tests_shadows(trace), mode="scalar"):
             dark = _shadow_test(trace, path.at, key, path.depth, path.active).dark
             vertex_probe.signature = mixed(vertex_probe.signature, dr.select(dark, mi.UInt32(1), 0))
         path.active &= _slides(trace, path.at)
@@ -99,10 +105,10 @@ def _scattered(
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Return the directions of the emitter sample and of the BSDF sample. If a sample has weight 0, return 0 for it."""
     u, ctx = VertexSamples.draw(CounterSampler.at_vertex(key, path.depth)), mi.BSDFContext()
-    light, lit = sample_light(trace, si, u.light, path.depth, active)
+    d, lit = sample_light(trace, si, u.light, path.depth, active)
     lobe, weight = si.bsdf().sample(ctx, si, u.lobe, u.direction, active & si.is_valid())
-    f = si.bsdf().eval(ctx, si, si.to_local(light.d), lit)
-    to_light = dr.select(lit & dr.any(f != 0), light.d, 0)
+    f = si.bsdf().eval(ctx, si, si.to_local(d), lit)
+    to_light = dr.select(lit & dr.any(f != 0), d, 0)
     return to_light, dr.select(dr.any(weight != 0), si.to_world(lobe.wo), 0)
 
 
@@ -150,7 +156,7 @@ def split_chains(trace: TraceConfig, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UI
         parted |= go_on & _probe_vertex(trace, a, key, go_on).differs(_probe_vertex(trace, b, key, go_on))
         go_on &= ~parted
     split = ChainSplit(a.depth, a.at, b.at, a.β, parted)
-    if dr.hint(trace.traits.hard_lights, mode="scalar"):
+    if dr.hint(tests_shadows(trace), mode="scalar"):
         shadow_a, shadow_b = (_shadow_test(trace, at, key, split.k, active & ~parted) for at in (a.at, b.at))
         split.shadows = shadow_a, shadow_b
         split.parted |= shadow_a.dark != shadow_b.dark

@@ -1,6 +1,7 @@
 """Hard shadows: test whether a light without extent reaches a point, and measure the distance to the shadow boundary.
 
-The shadow boundary is an edge for the camera, and for every vertex that sees the surface on which the shadow falls.
+The shadow boundary is an edge for the camera, and for every vertex that sees the surface on which the shadow falls. On
+light paths, the sensor takes the place of the light: a point is dark if an occluder hides it from the sensor.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport import arrive, scatter
 from pathreplay.transport.emitters import draw_emitter
 from pathreplay.transport.meet import meet
+from pathreplay.transport.sensor import SensorLink
 from pathreplay.transport.signature import edge_normal, outline_gap
+from pathreplay.transport.start import behind_emitters
 from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexSamples, is_smooth
 from pathreplay.transport.volume.passage import skip_null, transmittance_past_edge
 
@@ -30,11 +33,11 @@ class ShadowTest:
 
     u: mi.Point2f  # random numbers that select the light
     lit: mi.Bool  # a light without extent was sampled; the point may still be dark
-    Le: mi.Spectrum  # radiance divided by the probability of the light
+    Le: mi.Spectrum  # radiance divided by the probability of the light; on light paths, importance (`Sighting.W`)
     ray: mi.Ray3f  # towards the light
     hit: mi.PreliminaryIntersection3f
     outside: mi.Bool  # the point is outside a projector's image, or outside the cone of a spot with a sharp cutoff
-    uv: mi.Point2f  # position in the projector's image
+    uv: mi.Point2f  # position in the projector's image; on light paths, position on the film
     met: mi.PreliminaryIntersection3f | None = None  # surface hit at the tested point; None for a point in a medium
 
     @staticmethod
@@ -52,6 +55,8 @@ class ShadowTest:
     @staticmethod
     def at(trace: TraceConfig, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> ShadowTest:
         """Test whether the light that ``u`` selects reaches ``x``. With media, only occlusion is tested."""
+        if trace.to_sensor is not None:
+            return _test_of_sensor(trace, trace.to_sensor, x, u, active)
         light, Le = draw_emitter(trace.scene, x, u, active, visible=False)
         valid = active & (light.pdf != 0)
         lit, ray = valid & light.delta, x.spawn_ray_to(light.p)
@@ -69,6 +74,19 @@ class ShadowTest:
     @property
     def dark(self) -> mi.Bool:
         return self.outside | self.hit.is_valid()
+
+
+def _test_of_sensor(
+    trace: TraceConfig, link: SensorLink, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
+) -> ShadowTest:
+    """Test whether the sensor sees ``x``. As for light paths, hidden emitters do not occlude (`hide_emitters`)."""
+    to = link.sight(x, u, active)
+    lit, ray = active & to.valid, x.spawn_ray_to(to.end)
+    hit = meet(trace, ray, lit)
+    if trace.hide_emitters and trace.traits.area_lights:
+        hit = behind_emitters(trace, ray, hit, lit)
+        hit.t = dr.select(hit.t < ray.maxt, hit.t, dr.inf)
+    return ShadowTest(u, lit, mi.Spectrum(to.W), ray, hit, mi.Bool(False), to.s)
 
 
 @dataclass
@@ -91,12 +109,17 @@ class HardShadow:
     def scattered(self, trace: TraceConfig, at: Arrival, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """Return the light of the sampled emitter that the lit point scatters back along its path. Detached.
 
-        ``at`` is the arrival at the lit point. The ``key`` determines the random numbers of the path.
+        On a light path, return the contribution of the lit point to the film, times the adjoint of the image if there
+        is one. ``at`` is the arrival at the lit point. The ``key`` determines the random numbers of the path.
         """
         active, sampler = active & self.exists, CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_BEAM)
         flight = None if trace.media is None else Flight.none(trace.media)
         v = arrive.choose(trace, at, sampler, mi.Spectrum(1), active, flight)
-        L = scatter.towards(v, mi.BSDFContext(), self.lit.ray.d, active)[0] * self.lit.Le
+        link = trace.to_sensor
+        ctx = mi.BSDFContext(mi.TransportMode.Radiance if link is None else mi.TransportMode.Importance)
+        L = scatter.towards(v, ctx, self.lit.ray.d, active)[0] * self.lit.Le
+        if link is not None and link.adjoint is not None:
+            L *= link.adjoint(self.lit.uv, at.ray.wavelengths, active)
         if trace.media is not None:
             ray, turns = self.lit.ray, v.surface & v.si.is_medium_transition()
             medium = dr.select(turns, v.si.target_medium(ray.d), at.medium)
@@ -118,6 +141,9 @@ class HardShadow:
         B is differentiable in ``x``, the shapes and the light.
         """
         test, traits, active = self.test, self.trace.traits, active & self.exists
+        if self.trace.to_sensor is not None:
+            d = self.trace.to_sensor.sight(x, test.u, active).d
+            return outline_gap(self.n, x.p, d, test.hit, test.ray, active)
         light, _ = self.trace.scene.sample_emitter_direction(x, test.u, False, active)
         shadow = outline_gap(self.n, x.p, light.d, test.hit, test.ray, active & ~test.outside)
         if not traits.projectors and not traits.spots:
@@ -147,13 +173,22 @@ def _cone_gap(spot: mi.Emitter, light: mi.DirectionSample3f) -> mi.Float:
 
 def sample_light(
     trace: TraceConfig, si: mi.SurfaceInteraction3f, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
-) -> tuple[mi.DirectionSample3f, mi.Bool]:
-    """Sample an emitter at the k-th vertex; return the sample, and whether it is valid."""
+) -> tuple[mi.Vector3f, mi.Bool]:
+    """Sample the direction to an emitter (on a light path, to the sensor) at the k-th vertex.
+
+    Returns the direction, and whether it is valid.
+    """
     lit = _scatters(trace, si, k, active)
+    if trace.to_sensor is not None:
+        to = trace.to_sensor.sight(si, u, lit)
+        return to.d, lit & to.valid
     light, _ = draw_emitter(trace.scene, si, u, lit, visible=False)
-    return light, lit & (light.pdf != 0)
+    return light.d, lit & (light.pdf != 0)
 
 
 def _scatters(trace: TraceConfig, si: mi.SurfaceInteraction3f, k: mi.UInt32, active: mi.Bool) -> mi.Bool:
-    """Return whether the k-th vertex scatters emitter samples."""
-    return active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < trace.max_depth)
+    """Return whether the k-th vertex scatters emitter samples or, on a light path, light to the sensor."""
+    smooth = active & si.is_valid() & is_smooth(si.bsdf())
+    if trace.to_sensor is not None:
+        return smooth & ((k > 0) | (not trace.to_sensor.caustics))
+    return smooth & (k + 1 < trace.max_depth)

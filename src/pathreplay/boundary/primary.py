@@ -56,6 +56,32 @@ from pathreplay.transport.volume.passage import SHORT_OF
 
 
 @dataclass
+class Sides:
+    """What lies behind an edge, on side a and on side b."""
+
+    a: Arrival
+    b: Arrival
+    k: mi.UInt32  # number of vertices before the edge
+    shadow: HardShadow | None  # None if no vertex is tested for hard shadows
+    active: mi.Bool
+
+    def paths(self) -> list[PathState]:
+        """Return the paths that continue on the two sides. At the boundary of a hard shadow, they are not active."""
+        active = self.active if self.shadow is None else self.active & ~self.shadow.exists
+        one = mi.Spectrum(1), None, mi.Float(1)
+        return [PathState(side, *one, mi.UInt32(self.k), mi.Bool(active)) for side in (self.a, self.b)]
+
+    def shadow_jump(self, trace: TraceConfig, key: mi.UInt32) -> mi.Spectrum:
+        """Return f_a - f_b at the boundary of a hard shadow: the scattered light of the sampled emitter.
+
+        The emitter is not tested again for visibility: the two sides are so close that rounding would decide the test.
+        """
+        assert self.shadow is not None
+        L = self.shadow.scattered(trace, dr.select(self.shadow.in_a, self.b, self.a), key, self.active)
+        return dr.select(self.shadow.in_a, -L, L)
+
+
+@dataclass
 class FilmCrossing:
     """Crossing of a film segment with an edge: see `Crossing`."""
 
@@ -63,6 +89,7 @@ class FilmCrossing:
     near: Arrival
     n: mi.Vector3f
     crease: Crease
+    sides: Sides
     active: mi.Bool
 
     def gap(self, at: mi.Ray3f) -> mi.Float:
@@ -105,43 +132,46 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         if split.shadows is not None:
             shadow = HardShadow.between(self.chain, split.shadows[0], split.shadows[1], active)
             near_a = dr.select(shadow.exists, shadow.in_a, near_a)
-        jump = weight * split.β * self._jump(split, shadow, ray_a, key, active)
+        sides, T = self._sides(split, shadow, ray_a, key, active)
+        jump = weight * split.β * T * self.jump(sides, key)
 
         near, s = dr.select(near_a, split.a, split.b), dr.select(near_a, *ends)
         active = active & near.hit.is_valid()
         n = edge_normal(near.hit, near.ray, active)
         crease = Crease.of(self.chain, (split.a.hit, split.a.ray), (split.b.hit, split.b.ray), shadow, active)
         path, active = record_chain(self.chain, s, self.film.ray(s, key)[0], key, split.k, near.ray, active)
-        return Edges(path, [FilmCrossing(dr.select(active, jump, 0), near, n, crease, active)], None)
+        return Edges(path, [FilmCrossing(dr.select(active, jump, 0), near, n, crease, sides, active)], None)
 
-    def _jump(
+    def _sides(
         self, split: ChainSplit, shadow: HardShadow | None, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool
-    ) -> mi.Spectrum:
-        """Estimate f_a - f_b. ``ray`` is the camera ray of side a.
-
-        At the boundary of a hard shadow, this is the scattered light of the sampled emitter. The emitter is not tested
-        again for visibility: the two sides are so close that rounding would decide the test. At other edges, f_a and
-        f_b are estimated with the same random numbers.
-        """
+    ) -> tuple[Sides, mi.Spectrum]:
+        """Return what lies behind the edge, and the transmittance up to the edge. ``ray`` is the ray of side a."""
         trace = self.trace
-        # On coarse meshes, a triangle occludes the part of a lobe that lies below its plane. `steady` makes the shading
-        # frames continuous across triangles, so that only this occlusion differs between the two sides of a crease.
-        onward = replace(trace, steady_frames=trace.traits.coarse_meshes and not trace.traits.brushed_meshes)
-        sides, T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
+        (a, b), T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:
             t = SHORT_OF * dr.minimum(split.a.hit.t, split.b.hit.t)
             T, medium = transmittance_of_chain(trace, ray, key, split.k, t, active)
             active = active & dr.any(T != 0)
-            sides = [arrival_beyond(trace, side, t, medium, active) for side in sides]
-        f, sampled = [], active if shadow is None else active & ~shadow.exists
-        for side in sides:
-            path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(split.k), mi.Bool(sampled))
-            f.append(path_radiance(onward, CounterSampler.at_vertex(key, split.k), path)[0])
+            a, b = (arrival_beyond(trace, side, t, medium, active) for side in (a, b))
+        return Sides(a, b, mi.UInt32(split.k), shadow, active), T
+
+    @property
+    def onward(self) -> TraceConfig:
+        """The configuration of the paths behind an edge.
+
+        On coarse meshes, a triangle occludes the part of a lobe that lies below its plane. `steady` makes the shading
+        frames continuous across triangles, so that only this occlusion differs between the two sides of a crease.
+        """
+        traits = self.trace.traits
+        return replace(self.trace, steady_frames=traits.coarse_meshes and not traits.brushed_meshes)
+
+    def jump(self, sides: Sides, key: mi.UInt32) -> mi.Spectrum:
+        """Estimate f_a - f_b, with the same random numbers on both sides."""
+        f = [path_radiance(self.onward, CounterSampler.at_vertex(key, sides.k), path)[0] for path in sides.paths()]
         jump = f[0] - f[1]
-        if shadow is not None:
-            L = shadow.scattered(onward, dr.select(shadow.in_a, sides[1], sides[0]), key, active)
-            jump = dr.select(shadow.exists, dr.select(shadow.in_a, -L, L), jump)
-        return T * jump
+        if sides.shadow is None:
+            return jump
+        return dr.select(sides.shadow.exists, sides.shadow_jump(self.onward, key), jump)
 
     def slope(self, segment: FilmSegment, edges: Edges) -> mi.Vector2f:
         path, (crossing,) = edges.path, edges.crossings

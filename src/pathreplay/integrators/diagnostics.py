@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import mitsuba as mi
 
@@ -91,18 +91,22 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
         yield f"attach = 'all' keeps the directions of {', '.join(traits.detached_names)} fixed"
 
 
-def particle_notes(trace: TraceConfig, sensor: mi.Sensor) -> Iterator[str]:
-    """Yield messages about the derivatives that the gradient of light paths leaves out."""
+def particle_notes(trace: TraceConfig, sensor: mi.Sensor, omitted: Iterable[str] | None) -> Iterator[str]:
+    """Yield messages about the derivatives that the gradient of light paths leaves out.
+
+    ``omitted`` lists the edges that the boundary term leaves out. None means that there is no boundary term.
+    """
     if sensor.film().rfilter().is_box_filter():
         yield (
             f"the film of sensor '{sensor.id()}' has a box filter, whose derivative is zero: the motion of light paths "
             "across pixels is missing from the gradient; use a 'tent' or 'gaussian' filter"
         )
     moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
-    if moving:
+    left_out = "moving edges" if omitted is None else " and ".join(omitted)
+    if moving and left_out:
         yield (
-            f"'{moving[0]}' moves, and the gradient of light paths leaves out moving edges (changes of visibility "
-            "between emitters, surfaces and sensor): measure the error with 'pathreplay check'; see docs/particles.md"
+            f"'{moving[0]}' moves, and the gradient of light paths leaves out {left_out}: measure the error with "
+            "'pathreplay check'; see docs/particles.md"
         )
 
 

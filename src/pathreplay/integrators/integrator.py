@@ -35,6 +35,7 @@ from pathreplay.integrators.film.pixel_passes import obstacle, pixel_loss, scatt
 from pathreplay.integrators.film.surface_flow import SurfaceFlow, can_follow
 from pathreplay.integrators.interior import PathReplay
 from pathreplay.integrators.lifetimes import is_recording
+from pathreplay.integrators.particles.boundary import ParticleBoundary
 from pathreplay.integrators.particles.term import ParticleTerm
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.path_integrator import UNBOUNDED, PathIntegrator, reached
@@ -127,6 +128,20 @@ class PathReplayIntegrator(PathIntegrator):
         self.particles: ParticleTerm | None = ParticleTerm(self.max_depth, caustics=True) if split else None
         self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # a scene; state learned from it
 
+    def _light_terms(self, view: Pass, trace: TraceConfig) -> tuple[Term, ...]:
+        """Return the terms of light paths; empty if there are none.
+
+        The boundary term is left out as the boundary term of camera paths is (see `_needs_edges`), and with
+        ``boundary = 'primary'``.
+        """
+        if self.particles is None:
+            return ()
+        edges = ParticleBoundary(self.particles, self.boundary_spp)
+        if self.boundary in ("none", "primary") or not self._needs_edges(view, edges.move(view, trace)):
+            return (self.particles,)
+        Boundary.require(view, self.boundary_spp)
+        return self.particles, edges
+
     @property
     def terms(self) -> tuple[Term, ...]:
         """The interior and boundary terms. `_planned` may add a term for the motion of film positions."""
@@ -156,7 +171,8 @@ class PathReplayIntegrator(PathIntegrator):
         if self.particles is None:
             return PathIntegrator._forward(self, terms, part, trace, learned)
         camera = [term.forward(self._camera_view(part), trace, learned) for term in terms]
-        return reduce(add, camera, self.particles.forward(part, trace, learned))
+        light = [term.forward(part, trace, learned) for term in self._light_terms(part, trace)]
+        return reduce(add, camera + light)
 
     def _backward(
         self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None
@@ -165,7 +181,7 @@ class PathReplayIntegrator(PathIntegrator):
         if self.particles is None:
             return PathIntegrator._backward(self, terms, part, trace, grad_in, learned)
         unreached, results = [], []
-        for some, view in (((self.particles,), part), (terms, self._camera_view(part))):
+        for some, view in ((self._light_terms(part, trace), part), (terms, self._camera_view(part))):
             try:
                 results += [term.backward(view, trace, grad_in, learned) for term in some]
             except Unreached as error:
@@ -188,7 +204,7 @@ class PathReplayIntegrator(PathIntegrator):
         if self.boundary == "none":
             return view, trace, terms
         view = replace(view, flow=CameraFlow.of(view.scene, view.sensor))
-        needs_edges = self._needs_edges(view, trace)
+        needs_edges = self._needs_edges(view, Boundary.move(view, trace))
         if needs_edges:
             Boundary.require(view, self.boundary_spp)
         if needs_edges and follow and self._may_follow(view, trace):
@@ -207,12 +223,12 @@ class PathReplayIntegrator(PathIntegrator):
         """Return whether film positions may follow visible surfaces, which requires that all edges can be sampled."""
         return self.boundary != "primary" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
 
-    def _needs_edges(self, view: Pass, trace: TraceConfig) -> bool:
-        """Return whether edges move. With ``boundary = 'auto'``, return False if boundary terms cannot be computed.
+    def _needs_edges(self, view: Pass, move: bool) -> bool:
+        """Return whether edges ``move``. With ``boundary = 'auto'``, return False if no boundary term can be computed.
 
         With ``auto``, log either that the boundary terms are costly, or why they are left out.
         """
-        if not Boundary.move(view, trace):
+        if not move:
             return False
         why = Boundary.obstacle(view) if self.boundary == "auto" else ""
         if why:
@@ -375,7 +391,9 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
         if self.particles is not None and result.moves:
-            for note in particle_notes(trace, view.sensor):
+            edges = self.boundary in ("auto", "all")
+            omitted = ParticleBoundary.notes(view.scene, self.max_depth) if edges else None
+            for note in particle_notes(trace, view.sensor, omitted):
                 self._warn_once(note)
             if not self.particles.caustics:
                 return

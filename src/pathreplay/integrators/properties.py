@@ -132,7 +132,10 @@ PARTICLES: tuple[Property[object], ...] = (
     SAMPLES_PER_PASS,
     replace(ATTACH, meaning=f"{ATTACH.meaning} `none` leaves out all motion."),
     replace(
-        BOUNDARY, meaning=f"{BOUNDARY.meaning} The only edges are those of emitters that the sensor sees directly."
+        BOUNDARY,
+        meaning="Boundary terms of visibility: `none`, edges of emitters that the sensor sees (`primary`), or also "
+        "edges that light meets (`all`). `auto` is `all` if something that can occlude light moves, otherwise `none`.",
+        see="particles.md#visibility",
     ),
     BOUNDARY_SPP,
     *(

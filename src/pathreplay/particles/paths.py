@@ -33,6 +33,7 @@ from pathreplay.particles.film import ParticleFilm, colour, colour_adjoint
 from pathreplay.particles.start import Emission, EmitterSamples, EmitterStart
 from pathreplay.platform.device import device_of
 from pathreplay.samplers.owen_sobol import OwenSobolSampler
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.motion import path_moves, weights_vary
 from pathreplay.transport.path import PathState
 from pathreplay.transport.sensor import SensorLink
@@ -80,17 +81,23 @@ def particle_image(trace: TraceConfig, particles: Particles, film: ParticleFilm)
     while dr.hint(i < number, exclude=[trace, particles, film, sums], label="pathreplay: particles"):
         start = particles.start(trace, i)
         _, W = start.emit()
-        path = PathState.begin(trace, start)
-        sampler = start.sampler
-        while dr.hint(path.active, exclude=[trace, film, sums, W], label="pathreplay: light path"):
-            u, step = path.choose(trace, sampler)
-            assert step.splat is not None
-            at, c = film.footprint(step.splat.s), W * path.β * step.splat.c
-            film.add(sums, at, at.x, at.y, colour(c, path.at.ray.wavelengths), path.active & step.kept.lit)
-            path = path.advance(trace, u, step)[0]
+        splat_path(trace, start.sampler, PathState.begin(trace, start), W, film, sums)
         i += lanes
 
     return film.develop(sums * film.scale(particles.number))
+
+
+@dr.syntax
+def splat_path(
+    trace: TraceConfig, sampler: Sampler, path: PathState, W: mi.Spectrum, film: ParticleFilm, sums: mi.Float
+) -> None:
+    """Continue a light path, and add ``W`` times its contributions to the buffer ``sums``. Detached."""
+    while dr.hint(path.active, exclude=[trace, film, sums, W], label="pathreplay: light path"):
+        u, step = path.choose(trace, sampler)
+        assert step.splat is not None
+        at, c = film.footprint(step.splat.s), W * path.β * step.splat.c
+        film.add(sums, at, at.x, at.y, colour(c, path.at.ray.wavelengths), path.active & step.kept.lit)
+        path = path.advance(trace, u, step)[0]
 
 
 @dr.syntax
@@ -157,14 +164,7 @@ def particle_sweep(
             f"max_depth = {depth} is more than the record of a light path can hold: take up to {deepest(trace) + 1} "
             "where light paths are differentiated"
         )
-    A = film.adjoint(grad_in) * film.scale(particles.number)
-    dr.eval(A)
-
-    def adjoint(s: mi.Point2f, wavelengths: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
-        return colour_adjoint(film.gather(A, s, active), wavelengths)
-
-    assert trace.to_sensor is not None
-    trace = replace(trace, to_sensor=replace(trace.to_sensor, adjoint=adjoint))
+    trace = with_adjoint(trace, film, film.adjoint(grad_in) * film.scale(particles.number))
     moves = particles.moves(trace)
     layout = Layout.of(trace, moves)
     records = dr.alloc_local(record_type(layout), room_for(trace))
@@ -180,7 +180,7 @@ def particle_sweep(
 
     while dr.hint(
         i < number,
-        exclude=[trace, particles, film, A, adjoint, lost, layout, moves, varies, starts, start0, at0],
+        exclude=[trace, particles, lost, layout, moves, varies, starts, start0, at0],
         label="pathreplay: particles",
     ):
         start = particles.start(trace, i)
@@ -201,6 +201,20 @@ def particle_sweep(
                 backward(dr.sum(W * L) + dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
         i += lanes
     return moves
+
+
+def with_adjoint(trace: TraceConfig, film: ParticleFilm, A: mi.Float) -> TraceConfig:
+    """Return the configuration with an adjoint image, by which contributions to the film are multiplied.
+
+    ``A`` is the adjoint of a buffer of ``film``.
+    """
+    dr.eval(A)
+
+    def adjoint(s: mi.Point2f, wavelengths: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
+        return colour_adjoint(film.gather(A, s, active), wavelengths)
+
+    assert trace.to_sensor is not None
+    return replace(trace, to_sensor=replace(trace.to_sensor, adjoint=adjoint))
 
 
 def link_of(trace: TraceConfig, sensor: mi.Sensor, caustics: bool) -> TraceConfig:

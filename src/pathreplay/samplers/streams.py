@@ -25,6 +25,7 @@ class Stream(IntEnum):
     BOUNDARY = 0x5EED  # the boundary term; the interior term uses the seed itself
     PILOT = 0x7F4A7C15  # pilot segments, whose results determine where later segments are sampled
     CAST_SHADOWS = 0x2C1B3C6D
+    PARTICLE_EDGES = 0x4B1D5E77  # the boundary term of light paths
     PRIMARY_KEYS = 0x51ED270B
     SECONDARY_KEYS = 0x2545F491
     VOLUMETRIC_KEYS = 0x3C6EF372
@@ -46,6 +47,7 @@ class Stream(IntEnum):
     TRANSMITTANCE_PAST_EDGE = 0x60000
     TRANSMITTANCE_TO_EDGE = 0x70000
     TRANSMITTANCE_OF_BEAM = 0x80000
+    EMITTER = 0x90000  # first ray of a light path to an edge
     # The value is added to the initial state of the generator that selects one of the edges on a segment.
     BISECT_PRIMARY = 0
     BISECT_SECONDARY = 1

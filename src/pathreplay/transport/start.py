@@ -42,7 +42,7 @@ class CameraStart:
         hit = meet(trace, ray, active, coherent=True)
         if trace.skips_null:
             hit = skip_null(trace, ray, hit, active)
-        if trace.hide_emitters:
+        if trace.hide_emitters and trace.to_sensor is None:
             hit = behind_emitters(trace, ray, hit, active)
         at = Arrival(ray=ray, hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
         if trace.without_caustics:

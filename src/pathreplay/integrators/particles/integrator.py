@@ -44,7 +44,7 @@ class ParticleIntegrator(PathReplayIntegrator):
     Sensors: ``perspective``, ``thinlens``, ``orthographic`` and ``irradiancemeter``. The image is the same as with
     ``sample_border = true`` in the film (see `ParticleFilm`).
 
-    The integrator does not differentiate the visibility of vertices from each other and from the sensor. With
+    The integrator does not differentiate visibility that `ParticleBoundary` leaves out. With
     ``attach='none'``, it does not differentiate any motion. With a box filter, it does not differentiate the motion of
     film positions.
 

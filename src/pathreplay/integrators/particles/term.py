@@ -26,8 +26,8 @@ class ParticleTerm(Term):
     """Image and derivative of light paths. A pass traces as many light paths as it has samples.
 
     Every path is differentiated as in `PathReplay`, and also with respect to its film positions. The visibility of
-    vertices from each other and from the sensor is not differentiated. With a box filter, the motion of film positions
-    is not differentiated either.
+    vertices from each other and from the sensor is not differentiated here: see `ParticleBoundary`. With a box filter,
+    the motion of film positions is not differentiated.
     """
 
     max_depth: int  # depth of the whole path from emitter to sensor, counted as in Mitsuba
@@ -44,11 +44,11 @@ class ParticleTerm(Term):
 
     def image(self, view: Pass, trace: TraceConfig) -> mi.TensorXf | None:
         """Render the image, with zero alpha; None if no light path starts in the scene."""
-        work = self._work(view, trace)
+        work = self.work(view, trace)
         return None if work is None else particle_image(*work)
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        work, lost = self._work(view, trace), NonFiniteCounter()
+        work, lost = self.work(view, trace), NonFiniteCounter()
         if work is None:
             return TermResult(dr.zeros(mi.TensorXf, picture_shape(view.sensor)))
         image, moves = particle_tangent(*work, lost)
@@ -56,14 +56,18 @@ class ParticleTerm(Term):
         return TermResult(image, lost=lost.count, paths=work[1].number, moves=True) if moves else TermResult(image)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        work, lost = self._work(view, trace), NonFiniteCounter()
+        work, lost = self.work(view, trace), NonFiniteCounter()
         if work is None:
             raise Unreached("no light path starts at an emitter of the scene")
         moves = particle_sweep(*work, grad_in, lost)
         dr.eval()
         return TermResult(lost=lost.count, paths=work[1].number, moves=True) if moves else TermResult()
 
-    def _work(self, view: Pass, trace: TraceConfig) -> tuple[TraceConfig, Particles, ParticleFilm] | None:
+    def work(self, view: Pass, trace: TraceConfig) -> tuple[TraceConfig, Particles, ParticleFilm] | None:
+        """Return the configuration of light paths, the paths and the film; None if no light path starts in the scene.
+
+        ``trace`` is the configuration of the camera paths.
+        """
         emission = Emission.of(view.scene, view.sensor, self.caustics)
         if emission is None:
             return None

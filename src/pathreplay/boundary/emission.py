@@ -1,0 +1,33 @@
+"""Boundary term of light paths: edges that the light meets on its way from an emitter to the first smooth lobe.
+
+The random numbers of the first ray of a light path take the place of the film position in `primary`. Let f(u) be the
+contribution to the image of a light path whose first ray has the random numbers u. Two of these numbers vary, the
+others are fixed. The function f jumps where the light meets an occluder, directly or through chains of delta lobes, and
+where an occluder hides a vertex from the sensor. The terms of the derivative are those of `primary`, with the adjoint
+of the image as a factor of f.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+from pathreplay.boundary.edges import FilmDomain
+from pathreplay.boundary.primary import PrimarySearch, Sides
+from pathreplay.boundary.search import SegmentDensity
+from pathreplay.transport.vertex import TraceConfig
+
+
+@dataclass(frozen=True)
+class EmissionSearch(PrimarySearch):
+    """Edge search over the random numbers of first rays. Positions are random numbers, times the size of the domain."""
+
+    @classmethod
+    def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> EmissionSearch:
+        return cls(trace, film, SegmentDensity(int(film.size.x), int(film.size.y), 0.0), length)
+
+    def jump(self, sides: Sides, key: mi.UInt32) -> mi.Spectrum:
+        """Estimate f_a - f_b. Without an adjoint of the image, return 1: the caller adds both sides to the image."""
+        assert self.trace.to_sensor is not None
+        return mi.Spectrum(1) if self.trace.to_sensor.adjoint is None else super().jump(sides, key)

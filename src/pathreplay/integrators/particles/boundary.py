@@ -1,0 +1,99 @@
+"""The boundary term of light paths: derivative of an image due to moving edges (see `boundary.emission`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter
+from pathreplay.adjoint.baseline import Baseline
+from pathreplay.boundary.edges import Edges, edges_backward, edges_forward
+from pathreplay.boundary.emission import EmissionSearch
+from pathreplay.boundary.primary import FilmCrossing
+from pathreplay.integrators.boundary_term import Boundary, segments_of
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film.domain import FilmPlaces
+from pathreplay.integrators.particles.domain import CELLS, EmissionDomain, has_jumps
+from pathreplay.integrators.particles.term import ParticleTerm
+from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.integrators.term import Term, TermResult
+from pathreplay.particles.film import colour
+from pathreplay.particles.paths import Particles, splat_path, with_adjoint
+from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.samplers.streams import Stream
+from pathreplay.transport.motion import edges_move
+from pathreplay.transport.path import PathState
+from pathreplay.transport.vertex import TraceConfig
+
+CLOSER = 10
+"""Number of segments per bisected segment."""
+LENGTH = 0.5  # length of segments, in cells of `EmissionDomain`
+
+
+@dataclass(frozen=True)
+class ParticleBoundary(Term):
+    """The boundary term of light paths.
+
+    It contains the edges between an emitter and the first vertex with a smooth lobe, directly or through chains of
+    delta lobes, and the edges between this vertex and the sensor. Visibility after this vertex is not differentiated,
+    and neither is the light of emitters with `has_jumps`.
+    """
+
+    particles: ParticleTerm
+    spp: int = 0  # segments per pixel; 0 means the samples per pixel of the pass
+
+    def move(self, view: Pass, trace: TraceConfig) -> bool:
+        """Return whether edges depend on parameters with gradients. Nothing is evaluated."""
+        work = self.particles.work(view, trace)
+        if work is None:
+            return False
+        link, particles, _ = work
+        assert link.to_sensor is not None
+        start = particles.start(link, dr.arange(mi.UInt32, 1))
+        return link.to_sensor.moves() or edges_move(link, start, PathState.begin(link, start).at)
+
+    def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
+        work = self.particles.work(view, trace)
+        assert work is not None
+        link, particles, film = work
+        search, edges = self._edges(view, link, particles)
+        (crossing,), key = edges.crossings, edges.path.key
+        assert isinstance(crossing, FilmCrossing)
+        sides, shadow = crossing.sides, crossing.sides.shadow
+        assert shadow is not None
+        δ, sums = edges_forward(search.chain, search.film, edges), dr.zeros(mi.Float, 4 * film.pixels)
+        for path, weight in zip(sides.paths(), (δ, -δ), strict=True):
+            splat_path(search.onward, CounterSampler.at_vertex(key, sides.k), path, weight, film, sums)
+        at = film.footprint(shadow.lit.uv)
+        c = colour(δ * sides.shadow_jump(search.onward, key), edges.path.ray.wavelengths)
+        film.add(sums, at, at.x, at.y, c, shadow.exists)
+        return TermResult(film.develop(sums * (film.scale(1) / CELLS**2)))
+
+    def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
+        work, lost = self.particles.work(view, trace), NonFiniteCounter()
+        assert work is not None
+        link, particles, film = work
+        link = with_adjoint(link, film, film.adjoint(grad_in) * (film.scale(1) / CELLS**2))
+        search, edges = self._edges(view, link, particles)
+        edges_backward(search.chain, search.film, edges, mi.Spectrum(1), lost)
+        dr.eval()
+        return TermResult(lost=lost.count, paths=dr.width(edges.path.s), moves=True)
+
+    @staticmethod
+    def notes(scene: mi.Scene, max_depth: int) -> Iterator[str]:
+        """Yield what the term leaves out in a scene with light paths of ``max_depth`` segments."""
+        if max_depth > 2:
+            yield "edges that light meets after its first rough surface"
+        yield from (f"edges in the light of emitter '{each.id()}'" for each in scene.emitters() if has_jumps(each))
+
+    def _edges(self, view: Pass, trace: TraceConfig, particles: Particles) -> tuple[EmissionSearch, Edges]:
+        tables = facts_of(view.scene).recorded_tables(trace.traits.tables, edges=True)
+        trace = Boundary.informed(replace(view, flow=None), replace(trace, traits=replace(trace.traits, tables=tables)))
+        if any(shape.is_emitter() for shape in trace.traits.moving or ()):  # the light moves, and all edges in it
+            trace = replace(trace, traits=replace(trace.traits, moving=None))
+        search = EmissionSearch.of(trace, EmissionDomain(trace, particles.emission), LENGTH)
+        n = segments_of(view, FilmPlaces.of(view), self.spp)
+        return search, search.find(n, max(n // CLOSER, 1), Stream.PARTICLE_EDGES.of(view.opaque_seed))
