@@ -6,6 +6,7 @@ import gc
 import subprocess
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -291,8 +292,11 @@ def test_a_pass_beside_one_of_another_thread_is_refused() -> None:
 
 
 def test_a_thread_that_collects_garbage_disturbs_no_pass() -> None:
-    """It knows nothing of Mitsuba; Python collects in whatever thread makes objects."""
-    done = threading.Event()
+    """It knows nothing of Mitsuba; Python collects in whatever thread makes objects.
+
+    A collection takes long where many objects are alive, and the passes wait for it: they stop after some seconds.
+    """
+    done, until = threading.Event(), time.monotonic() + 4
 
     def litter() -> None:
         while not done.is_set():
@@ -305,6 +309,8 @@ def test_a_thread_that_collects_garbage_disturbs_no_pass() -> None:
         for _ in range(20000):
             with careful():
                 pass
+            if time.monotonic() > until:
+                break
     finally:
         done.set()
         thread.join()
