@@ -136,12 +136,14 @@ class ArcSegment(Arc):
         at_near, at_far = (observer.arrival(side.ray, side.hit, pdf) for side in (near, far))
         arrivals = off_contact(trace, at_near, at_far, active)
         T, arrivals = observer.onward(arrivals, SHORT_OF * near.edge.t, self.key, active & through)
-        K, depth = [], x.depth + 1
+        L, depth, shadow = [], x.depth + 1, edge.crease.shadow
         for arrival in arrivals:
             path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < trace.max_depth))
-            L, _ = path_radiance(trace, CounterSampler.stream(self.key, Stream.BEYOND_EDGE), path)
-            K.append(dr.select(active, common * T * L, 0))
-        return K[0], K[1]
+            L.append(path_radiance(trace, CounterSampler.stream(self.key, Stream.BEYOND_EDGE), path)[0])
+        if shadow is not None:  # the near side is dark, and the far side is too close to it for another test
+            L[1] = dr.select(shadow.exists, L[0] + shadow.scattered(trace, arrivals[1], self.key, active), L[1])
+        K_near, K_far = (dr.select(active, common * T * side, 0) for side in L)
+        return K_near, K_far
 
 
 @dataclass
