@@ -161,6 +161,15 @@ def plain() -> dict:
     return paint(0.7, 0.6, 0.5)
 
 
+def glossy() -> dict:
+    """Plastic so dark that nearly half of the samples are reflected."""
+    return {"type": "plastic", "diffuse_reflectance": rgb(0.05, 0.06, 0.04)}
+
+
+def bulb() -> dict:
+    return {"type": "point", "position": [1.6, 1.2, 2.5], "intensity": rgb(40, 30, 50)}
+
+
 def ball_lamp() -> dict:
     return lamp(T().translate([1.6, 1.2, 2.5]).scale(0.4), kind="sphere")
 
@@ -403,6 +412,10 @@ SHADOWS = [
     cell("shadow_receiver", shadow(wall=plain), "wall.to_world", UP),
     cell("shadow_all", shadow(wall=plain), SEVERAL, UP),
     cell("shadow_sphere", shadow(lambda: shape(SHADE.scale(0.3), BLACK, "sphere")), OBJECT, translate(*ASIDE)),
+    cell("shadow_hard", shadow(lambda: shape(SHADE.scale(0.3), BLACK, "sphere"), light=bulb), OBJECT,
+         translate(*ASIDE)),
+    cell("shadow_on_plastic", shadow(lambda: shape(SHADE.scale(0.3), BLACK, "sphere"), glossy, bulb), OBJECT,
+         translate(*ASIDE)),
     cell("shadow_cube8", shadow(lambda: cube8(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
     cell("shadow_cube24", shadow(lambda: cube24(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
     cell("copies_move", two_copies, "group.box.vertex_positions", translate_vertices(*ASIDE), 3),

@@ -143,6 +143,9 @@ def split_chains(trace: TraceConfig, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UI
     parted = active & _probe_vertex(trace, a, key, active).differs(_probe_vertex(trace, b, key, active))
     go_on = active & ~parted
     while dr.hint(go_on, exclude=[trace], label="pathreplay: split"):
+        if dr.hint(tests_shadows(trace), mode="scalar"):
+            dark_a, dark_b = (_shadow_test(trace, path.at, key, path.depth, go_on).dark for path in (a, b))
+            go_on &= dark_a == dark_b
         go_on &= _slides(trace, a.at)
         a.active, b.active = mi.Bool(go_on), mi.Bool(go_on)
         u_a, step_a = a.choose(trace, sampler_a)
