@@ -71,7 +71,11 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
         if dr.hint(tests_shadows(trace), mode="scalar"):
             dark = _shadow_test(trace, path.at, key, path.depth, path.active).dark
             vertex_probe.signature = mixed(vertex_probe.signature, dr.select(dark, mi.UInt32(1), 0))
-        path.active &= _slides(trace, path.at)
+        slides = _slides(trace, path.at)
+        if dr.hint(trace.to_sensor is not None and trace.to_sensor.caustics, mode="scalar"):
+            # A path whose first vertex has no delta lobe carries no caustic.
+            vertex_probe = dr.select((path.depth == 0) & ~slides, VisibilityProbe.of(), vertex_probe)
+        path.active &= slides
         u, step = path.choose(trace, sampler)
         step.active &= step.kept.delta
         lobe = dr.select(step.active, step.kept.lobe + 1, 0)

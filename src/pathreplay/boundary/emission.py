@@ -1,4 +1,4 @@
-"""Boundary term of light paths: edges that the light meets on its way from an emitter to the first smooth lobe.
+"""Boundary term of light paths: edges between an emitter and the first rough surface, and before the sensor.
 
 The random numbers of the first ray of a light path take the place of the film position in `primary`. Let f(u) be the
 contribution to the image of a light path whose first ray has the random numbers u. Two of these numbers vary, the

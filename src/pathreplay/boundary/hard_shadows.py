@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport import arrive, scatter
 from pathreplay.transport.emitters import draw_emitter
@@ -31,8 +32,8 @@ class ShadowTest:
     A point is dark if it is occluded, outside a projector's image, or outside the cone of a spot with a sharp cutoff.
     """
 
-    u: mi.Point2f  # random numbers that select the light
-    lit: mi.Bool  # a light without extent was sampled; the point may still be dark
+    u: mi.Point2f  # random numbers that select the light or, on light paths, the point on the aperture
+    lit: mi.Bool  # a light without extent was sampled, or the sensor is in view; the point may still be dark
     Le: mi.Spectrum  # radiance divided by the probability of the light; on light paths, importance (`Sighting.W`)
     ray: mi.Ray3f  # towards the light
     hit: mi.PreliminaryIntersection3f
@@ -56,6 +57,7 @@ class ShadowTest:
     def at(trace: TraceConfig, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> ShadowTest:
         """Test whether the light that ``u`` selects reaches ``x``. With media, only occlusion is tested."""
         if trace.to_sensor is not None:
+            assert isinstance(x, mi.SurfaceInteraction3f)
             return _test_of_sensor(trace, trace.to_sensor, x, u, active)
         light, Le = draw_emitter(trace.scene, x, u, active, visible=False)
         valid = active & (light.pdf != 0)
@@ -77,9 +79,11 @@ class ShadowTest:
 
 
 def _test_of_sensor(
-    trace: TraceConfig, link: SensorLink, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
+    trace: TraceConfig, link: SensorLink, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool
 ) -> ShadowTest:
-    """Test whether the sensor sees ``x``. As for light paths, hidden emitters do not occlude (`hide_emitters`)."""
+    """Test whether the sensor sees ``x``. Hidden emitters (`hide_emitters`) are not seen, and do not occlude."""
+    if trace.hide_emitters and trace.traits.area_lights:
+        active = active & (x.shape.emitter() == None)  # noqa: E711 (an array of pointers)
     to = link.sight(x, u, active)
     lit, ray = active & to.valid, x.spawn_ray_to(to.end)
     hit = meet(trace, ray, lit)
@@ -121,15 +125,26 @@ class HardShadow:
         if link is not None and link.adjoint is not None:
             L *= link.adjoint(self.lit.uv, at.ray.wavelengths, active)
         if trace.media is not None:
-            ray, turns = self.lit.ray, v.surface & v.si.is_medium_transition()
-            medium = dr.select(turns, v.si.target_medium(ray.d), at.medium)
-            L *= transmittance_past_edge(trace, ray, self.test.hit.t, medium, sampler, active)
+            turns = v.surface & v.si.is_medium_transition()
+            L *= self.blocked(trace, dr.select(turns, v.si.target_medium(self.lit.ray.d), at.medium), sampler, active)
         return dr.select(active, L, 0)
+
+    def blocked(self, trace: TraceConfig, medium: mi.MediumPtr, sampler: Sampler, active: mi.Bool) -> mi.Spectrum:
+        """Return the part of the light that only the lit point receives, in a scene with media. Detached.
+
+        It is the transmittance of the shadow ray from the lit point, which starts in ``medium``, less the light that
+        passes a half-transparent occluder.
+        """
+        T = transmittance_past_edge(trace, self.lit.ray, self.test.hit.t, medium, sampler, active)
+        occluded = active & ~self.test.outside & self.test.hit.is_valid()
+        si = self.test.hit.compute_surface_interaction(self.test.ray, compat.shading(), occluded)
+        passes = si.bsdf(self.test.ray).eval_null_transmission(si, occluded)
+        return T * dr.select(occluded, 1 - passes, 1)
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """Evaluate B, which is zero on the shadow boundary, at the hit of ``ray``.
 
-        B is differentiable in the ray, the shapes and the light.
+        B is differentiable in the ray, the shapes, and the light or sensor.
         """
         assert self.test.met is not None
         si = self.test.met.compute_surface_interaction(ray, compat.shading(), active & self.exists)
@@ -138,7 +153,7 @@ class HardShadow:
     def gap_at(self, x: mi.Interaction3f, active: mi.Bool) -> mi.Float:
         """Evaluate B, which is zero on the shadow boundary, at ``x``.
 
-        B is differentiable in ``x``, the shapes and the light.
+        B is differentiable in ``x``, the shapes, and the light or sensor.
         """
         test, traits, active = self.test, self.trace.traits, active & self.exists
         if self.trace.to_sensor is not None:

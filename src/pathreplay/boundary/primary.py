@@ -63,6 +63,7 @@ class Sides:
     b: Arrival
     k: mi.UInt32  # number of vertices before the edge
     shadow: HardShadow | None  # None if no vertex is tested for hard shadows
+    lit: Arrival  # at the boundary of a hard shadow, the arrival on the lit side
     active: mi.Bool
 
     def paths(self) -> list[PathState]:
@@ -77,7 +78,7 @@ class Sides:
         The emitter is not tested again for visibility: the two sides are so close that rounding would decide the test.
         """
         assert self.shadow is not None
-        L = self.shadow.scattered(trace, dr.select(self.shadow.in_a, self.b, self.a), key, self.active)
+        L = self.shadow.scattered(trace, self.lit, key, self.active)
         return dr.select(self.shadow.in_a, -L, L)
 
 
@@ -125,7 +126,8 @@ class PrimarySearch(FilmSearch[FilmSegment]):
 
     def edge(self, segment: FilmSegment, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
         ends, key = (segment.at(a), segment.at(b)), segment.key
-        (ray_a, weight), (ray_b, _) = (self.film.ray(s, key) for s in ends)
+        (ray_a, weight), (ray_b, weight_b) = (self.film.ray(s, key) for s in ends)
+        weight = dr.select(dr.any(weight_b != 0), weight, 0)  # at an edge of the weight itself, nothing is visible
         split = split_chains(self.chain, (ray_a, ray_b), key, active)
         active = active & split.parted
         near_a, shadow = split.a.hit.t <= split.b.hit.t, None
@@ -147,13 +149,15 @@ class PrimarySearch(FilmSearch[FilmSegment]):
     ) -> tuple[Sides, mi.Spectrum]:
         """Return what lies behind the edge, and the transmittance up to the edge. ``ray`` is the ray of side a."""
         trace = self.trace
+        lit = split.a if shadow is None else dr.select(shadow.in_a, split.b, split.a)
         (a, b), T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:
             t = SHORT_OF * dr.minimum(split.a.hit.t, split.b.hit.t)
             T, medium = transmittance_of_chain(trace, ray, key, split.k, t, active)
             active = active & dr.any(T != 0)
             a, b = (arrival_beyond(trace, side, t, medium, active) for side in (a, b))
-        return Sides(a, b, mi.UInt32(split.k), shadow, active), T
+            lit = replace(lit, medium=medium, behind=mi.Float(0))
+        return Sides(a, b, mi.UInt32(split.k), shadow, lit, active), T
 
     @property
     def onward(self) -> TraceConfig:

@@ -33,7 +33,7 @@ from pathreplay.transport.start import CameraStart, medium_around
 from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Flight, TraceConfig, VertexSamples
 from pathreplay.transport.volume.media import interaction
-from pathreplay.transport.volume.passage import skip_null, transmittance_past_edge, transmittance_up_to
+from pathreplay.transport.volume.passage import skip_null, transmittance_up_to
 
 
 @dataclass
@@ -118,9 +118,8 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         active = observer.active & observer.at.medium.use_emitter_sampling() & (trace.max_depth > 1)
         sampler = CounterSampler.stream(segment.key, Stream.TRANSMITTANCE_OF_BEAM)
         T = transmittance_up_to(trace, ray, segment.τ, medium_around(trace), sampler, active)[0]
-        lit_test = shadow.lit
-        T *= transmittance_past_edge(trace, lit_test.ray, shadow.test.hit.t, observer.at.medium, sampler, active)
-        f = T * observer.selected.β * observer.towards(lit_test.ray.d, active)[0] * lit_test.Le
+        T *= shadow.blocked(trace, observer.at.medium, sampler, active)
+        f = T * observer.selected.β * observer.towards(shadow.lit.ray.d, active)[0] * shadow.lit.Le
         return dr.select(active, f, 0)
 
     def _hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:

@@ -170,8 +170,8 @@ class PathReplayIntegrator(PathIntegrator):
     def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         if self.particles is None:
             return PathIntegrator._forward(self, terms, part, trace, learned)
-        camera = [term.forward(self._camera_view(part), trace, learned) for term in terms]
         light = [term.forward(part, trace, learned) for term in self._light_terms(part, trace)]
+        camera = [term.forward(self._camera_view(part), trace, learned) for term in terms]
         return reduce(add, camera + light)
 
     def _backward(
@@ -392,7 +392,7 @@ class PathReplayIntegrator(PathIntegrator):
     def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
         if self.particles is not None and result.moves:
             edges = self.boundary in ("auto", "all")
-            omitted = ParticleBoundary.notes(view.scene, self.max_depth) if edges else None
+            omitted = ParticleBoundary(self.particles).notes(view.scene) if edges else None
             for note in particle_notes(trace, view.sensor, omitted):
                 self._warn_once(note)
             if not self.particles.caustics:

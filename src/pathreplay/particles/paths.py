@@ -221,7 +221,10 @@ def link_of(trace: TraceConfig, sensor: mi.Sensor, caustics: bool) -> TraceConfi
     """Return the configuration with which light paths to a sensor are traced.
 
     A light path of ``max_depth`` segments has ``max_depth`` - 1 vertices, because neither emitter nor sensor counts as
-    a vertex. With ``caustics``, only the paths that `TraceConfig.without_caustics` omits are traced.
+    a vertex. With ``caustics``, only the paths that `TraceConfig.without_caustics` omits are traced. Directions from
+    smooth lobes follow their hit points, because no boundary term follows a smooth lobe (`TraceConfig.may_slide`).
     """
     link = replace(SensorLink.of(sensor), caustics=caustics)
-    return replace(trace, to_sensor=link, max_depth=max(trace.max_depth - 1, 0), without_caustics=False)
+    return replace(
+        trace, to_sensor=link, max_depth=max(trace.max_depth - 1, 0), without_caustics=False, may_slide=False
+    )

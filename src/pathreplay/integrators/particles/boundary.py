@@ -82,17 +82,16 @@ class ParticleBoundary(Term):
         dr.eval()
         return TermResult(lost=lost.count, paths=dr.width(edges.path.s), moves=True)
 
-    @staticmethod
-    def notes(scene: mi.Scene, max_depth: int) -> Iterator[str]:
-        """Yield what the term leaves out in a scene with light paths of ``max_depth`` segments."""
-        if max_depth > 2:
+    def notes(self, scene: mi.Scene) -> Iterator[str]:
+        """Yield what the term leaves out in a scene."""
+        if self.particles.max_depth > 2 + self.particles.caustics:
             yield "edges that light meets after its first rough surface"
         yield from (f"edges in the light of emitter '{each.id()}'" for each in scene.emitters() if has_jumps(each))
 
     def _edges(self, view: Pass, trace: TraceConfig, particles: Particles) -> tuple[EmissionSearch, Edges]:
         tables = facts_of(view.scene).recorded_tables(trace.traits.tables, edges=True)
         trace = Boundary.informed(replace(view, flow=None), replace(trace, traits=replace(trace.traits, tables=tables)))
-        if any(shape.is_emitter() for shape in trace.traits.moving or ()):  # the light moves, and all edges in it
+        if any(shape.is_emitter() for shape in trace.traits.moving or ()):  # every edge moves relative to such light
             trace = replace(trace, traits=replace(trace.traits, moving=None))
         search = EmissionSearch.of(trace, EmissionDomain(trace, particles.emission), LENGTH)
         n = segments_of(view, FilmPlaces.of(view), self.spp)

@@ -13,8 +13,8 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport.vertex import TraceConfig
 
 CELLS = 32
-"""Number of cells along a side of the unit square. The density of segments is constant in each cell, and with more
-cells than pilot segments it would be poor."""
+"""Number of cells along a side of the unit square. The density of segments is constant in each cell. With more cells
+than pilot segments, the density would be estimated poorly."""
 BY_PLACE = frozenset({"SpotLight", "DirectionalEmitter", "DirectionalArea", "EnvironmentMapEmitter"})
 """Classes of emitters whose rays vary continuously with the random numbers ``place`` (of `EmitterSamples`). The rays of
 all others vary continuously with the random numbers ``direction``."""
@@ -62,7 +62,7 @@ class EmissionDomain:
 
 
 def has_jumps(emitter: mi.Emitter) -> bool:
-    """Return whether the rays of an emitter jump as the random numbers vary, between texels or between triangles.
+    """Return whether the rays of an emitter may jump as the random numbers vary, between texels or between triangles.
 
     In the light of such an emitter, no edges are found.
     """
