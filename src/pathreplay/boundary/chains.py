@@ -1,4 +1,4 @@
-"""Probes, compares and records chains. A chain is the part of a camera path that passes only through delta lobes.
+"""Probes, compares and records chains. A chain is the first part of a path, which passes only through delta lobes.
 
 Two neighbouring chains use the same random numbers, and therefore usually select the same lobes. If a lobe is selected
 with different probabilities on the two chains, the chains may continue along different lobes of the same surface. Such
@@ -52,7 +52,7 @@ def tests_shadows(trace: TraceConfig) -> bool:
 
 @dr.syntax
 def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> VisibilityProbe:
-    """Probe a path from the camera to its first vertex without a delta lobe.
+    """Probe a path from the camera, or from an emitter, to its first vertex without a delta lobe.
 
     Vertices before the first surface that may move are not compared, apart from the first (`VisibilityProbe.still`).
     In lanes with ``flows`` (see `FilmDomain`), the camera ray may move, so that all surfaces count as moving.
@@ -135,7 +135,7 @@ class ChainSplit:
     b: Arrival
     β: mi.Spectrum  # throughput before the vertex
     parted: mi.Bool  # the chains diverge
-    shadows: tuple[ShadowTest, ShadowTest] | None = None  # None if no light of the scene casts hard shadows
+    shadows: tuple[ShadowTest, ShadowTest] | None = None  # None if no vertex is tested: see `tests_shadows`
 
 
 @dr.syntax

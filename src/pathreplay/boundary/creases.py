@@ -40,7 +40,7 @@ class Crease:
     b: mi.PreliminaryIntersection3f
     meets: mi.Bool  # two surfaces are in contact, at an angle
     turns: mi.Bool  # the hits are on one sheet, and only one of their shading normals faces the ray
-    shadow: HardShadow | None  # None if no light of the scene casts hard shadows
+    shadow: HardShadow | None  # None if no vertex is tested for hard shadows
 
     @staticmethod
     def of(trace: TraceConfig, side_a: Side, side_b: Side, shadow: HardShadow | None, active: mi.Bool) -> Crease:

@@ -1,4 +1,4 @@
-"""Edges: derivatives due to the motion of edges, propagated along the camera paths that see the edges.
+"""Edges: derivatives due to the motion of edges, propagated along the paths that see or meet the edges.
 
 An edge is the zero set of a function B(ray, π) of a ray and the parameters π. Its motion follows from dB/dπ. The
 contribution of the edge to the derivative of the radiance at film position s is
@@ -38,7 +38,11 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 class FilmDomain(Protocol):
-    """The part of the film on which paths start. Positions (Point2f, pixels) range from 0 at a corner to ``size``."""
+    """The part of the film on which paths start.
+
+    Positions (Point2f, pixels) range from 0 at a corner to ``size``. On light paths, two random numbers of the first
+    ray take the place of the film position.
+    """
 
     @property
     def size(self) -> mi.ScalarVector2f: ...
@@ -76,7 +80,7 @@ class Crossing(Protocol):
 
 @dataclass
 class EdgePath:
-    """The camera path that sees an edge: ``k`` vertices, and the ray from the last vertex to the edge."""
+    """The path that sees or meets an edge: ``k`` vertices, and the ray from the last vertex to the edge."""
 
     s: mi.Point2f  # film position
     key: mi.UInt32  # seed of the path's random numbers

@@ -37,7 +37,10 @@ class CameraStart:
     active: mi.Bool
 
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
-        """Intersect the rays with the scene, through area emitters if these are hidden. Nothing is differentiated."""
+        """Intersect the rays with the scene. Nothing is differentiated.
+
+        Camera rays pass through area emitters if these are hidden. Chains of light paths, which start here too, do not.
+        """
         ray = mi.Ray3f(dr.detach(self.ray))
         hit = meet(trace, ray, active, coherent=True)
         if trace.skips_null:
