@@ -330,46 +330,24 @@ def shift(value: Any, t: Any) -> Any:
 
 BLACK = {"type": "diffuse", "reflectance": 0.0}
 SIDEWAYS = translate(0.3, 0.7, 0)
-IN_CAUSTIC, BEFORE_EYE = [0.1, 0.1, -1.2], [1.2, 0.05, -1.35]
+BEFORE_EYE = [1.2, 0.05, -1.35]
+in_caustic, before_eye = (partial(with_ball, center, 0.12, BLACK) for center in ([0.1, 0.1, -1.2], BEFORE_EYE))
 edge: Callable[..., Mean] = partial(mean, spp=1024, step=2e-2, options={"boundary": "all"})
 ball: Callable[..., Mean] = partial(edge, key="ball.to_world", move=SIDEWAYS, depth=6, **OWN)
+behind: Callable[..., Mean] = partial(edge, depth=4, step=1e-2, **OWN)  # the slab
 once: Callable[..., Mean] = partial(edge, key="ball.to_world", move=SIDEWAYS, depth=2)
 BLOCKERS = (
-    ball("blocker in the caustic", lambda: with_ball(IN_CAUSTIC, 0.12, BLACK)),
-    ball("blocker before the slab", lambda: with_ball([0.1, 0.1, 1.2], 0.12, BLACK), step=1e-2),
-    ball("blocker before the camera", lambda: with_ball(BEFORE_EYE, 0.12, BLACK)),
+    ball("blocker in the caustic", in_caustic),
+    ball("blocker before the slab", partial(with_ball, [0.1, 0.1, 1.2], 0.12, BLACK), step=1e-2),
+    ball("blocker before the camera", before_eye),
 )
 EDGES = (
     *BLOCKERS,
-    edge("index, blocker", lambda: with_ball(IN_CAUSTIC, 0.12, BLACK), "top.bsdf.eta", add(), depth=4, **OWN),
-    edge(
-        "heights, blocker",
-        lambda: with_ball(IN_CAUSTIC, 0.12, BLACK),
-        "top.vertex_positions",
-        waves,
-        depth=4,
-        step=1e-2,
-        **OWN,
-    ),
-    edge(
-        "spot, blocker",
-        lambda: with_ball(IN_CAUSTIC, 0.12, BLACK),
-        "light.to_world",
-        translate(0.3, 0, 0.1),
-        depth=4,
-        step=1e-2,
-        **OWN,
-    ),
-    edge(
-        "camera, blocker",
-        lambda: with_ball(BEFORE_EYE, 0.12, BLACK),
-        "sensor.to_world",
-        translate(0.3, 0.7, 0.2),
-        depth=4,
-        step=1e-2,
-        **OWN,
-    ),
-    edge("border of the floor", small_floor, "floor.to_world", SIDEWAYS, depth=4, step=1e-2, **OWN),
+    behind("index, blocker", in_caustic, "top.bsdf.eta", add(), step=2e-2),
+    behind("heights, blocker", in_caustic, "top.vertex_positions", waves),
+    behind("spot, blocker", in_caustic, "light.to_world", translate(0.3, 0, 0.1)),
+    behind("camera, blocker", before_eye, "sensor.to_world", translate(0.3, 0.7, 0.2)),
+    behind("border of the floor", small_floor, "floor.to_world", SIDEWAYS),
     once("ball, point", partial(lit_by, "point")),
     once("ball, spot", partial(lit_by, "spot")),
     once("ball, area", partial(lit_by, "area")),

@@ -127,7 +127,7 @@ class PrimarySearch(FilmSearch[FilmSegment]):
     def edge(self, segment: FilmSegment, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
         ends, key = (segment.at(a), segment.at(b)), segment.key
         (ray_a, weight), (ray_b, weight_b) = (self.film.ray(s, key) for s in ends)
-        weight = dr.select(dr.any(weight_b != 0), weight, 0)  # at an edge of the weight itself, nothing is visible
+        weight = dr.select(dr.any(weight_b != 0), weight, 0)  # an edge of the emission, not of visibility
         split = split_chains(self.chain, (ray_a, ray_b), key, active)
         active = active & split.parted
         near_a, shadow = split.a.hit.t <= split.b.hit.t, None
