@@ -46,7 +46,11 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
 
 
 def tests_shadows(trace: TraceConfig) -> bool:
-    """Return whether visibility is tested at the vertices of a chain: of hard lights or, on light paths, the sensor."""
+    """Return whether the vertices of a chain are tested for hard shadows.
+
+    On camera paths, the test is whether a light without extent reaches the vertex. On light paths, it is whether the
+    sensor sees the vertex.
+    """
     return trace.to_sensor is not None or trace.traits.hard_lights
 
 

@@ -70,7 +70,7 @@ class VisibilityProbe:
         return VisibilityProbe(mi.UInt32(signature), mi.Point3f(0), mi.Normal3f(0))
 
     def differs(self, other: VisibilityProbe) -> mi.Bool:
-        """Return whether different shapes are visible, or different sheets of one shape: see `hides_itself`."""
+        """Return whether there is an edge between the probes that may move: see `edge_importance`."""
         return self.edge_importance(other) > 0
 
     def edge_importance(self, other: VisibilityProbe) -> mi.Float:
@@ -196,9 +196,9 @@ def middle_weight(m: mi.Float) -> mi.Float:
     The probe differs on an interval around the middle. ``m`` is the length of this interval, divided by the length l of
     the segment. The weight compensates for segments that contain such an interval beside their middle: these segments
     do not detect the interval. Suppose that a segment is shifted along its own line. The segment contains the whole
-    interval for a range of shifts of size (1 - m) l. In addition, the middle of the segment lies in the interval for a
-    range of size min(m, 1 - m) l. The weight is the ratio of the two sizes. This ratio is unbounded for small m. The
-    weight is therefore constant for all m below `MIN_FRACTION`. The constant gives the correct expectation at corners,
+    interval for a range of shifts of size (1 - m) l. For a part of this range, of size min(m, 1 - m) l, the middle of
+    the segment also lies in the interval. The weight is the ratio of the two sizes, which is unbounded for small m. It
+    is therefore constant for all m below `MIN_FRACTION`. The constant gives the correct expectation at corners,
     where all m are equally likely.
     """
     return dr.select(m < MIN_FRACTION, 2 / MIN_FRACTION - 1, dr.select(m < 0.5, (1 - m) / m, 1))

@@ -120,7 +120,10 @@ def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spe
 
 @dr.syntax
 def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges) -> mi.Spectrum:
-    """Return the tangent of the radiance at the film positions. The parameters must carry tangents."""
+    """Return what the edges contribute to the tangent of the radiance at the film positions.
+
+    The parameters must carry tangents.
+    """
     path = edges.path
     with dr.resume_grad():
         ray = film.ray(path.s, path.key)[0]

@@ -33,7 +33,7 @@ class ShadowTest:
     """
 
     u: mi.Point2f  # random numbers that select the light or, on light paths, the point on the aperture
-    lit: mi.Bool  # a light without extent was sampled, or the sensor is in view; the point may still be dark
+    lit: mi.Bool  # the point was tested: a light without extent was sampled, or the point projects onto the film
     Le: mi.Spectrum  # radiance divided by the probability of the light; on light paths, importance (`Sighting.W`)
     ray: mi.Ray3f  # towards the light
     hit: mi.PreliminaryIntersection3f

@@ -189,7 +189,10 @@ class OcclusionEdge:
         return self.own | self.crease.exists
 
     def crease_gap(self, ray: mi.Ray3f, n: mi.Normal3f) -> mi.Float:
-        """Evaluate B, which is zero on the crease. ``n`` is the normal of the observer's triangle."""
+        """Evaluate B (see `edges`), which is zero on the crease.
+
+        ``n`` is the normal of the observer's triangle. It is used if the edge lies in the plane of this triangle.
+        """
         return dr.select(self.own, dr.dot(n, ray.d), self.crease.gap(ray, self.active & ~self.own))
 
 

@@ -193,10 +193,12 @@ class PathReplayIntegrator(PathIntegrator):
     def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """Return the pass with its film flow, its trace configuration, and the terms of its gradient.
 
-        If the pass has a film flow, the terms include `FilmMotion`. The other terms then only differentiate motion that
-        the flow does not contain. With ``follow``, the flow may follow visible surfaces (`SurfaceFlow`). The boundary
-        term is left out if no edge moves, or if ``boundary = 'auto'`` and the term cannot be computed. The interior
-        term is left out if `FilmMotion` is the whole derivative.
+        A film flow is a velocity field of film positions (see `FilmFlow`). If the pass has one, the terms include
+        `FilmMotion`, and the other terms only differentiate motion that the flow does not contain. With ``follow``, the
+        flow may follow visible surfaces (`SurfaceFlow`).
+
+        The boundary term is left out if no edge moves, or if ``boundary = 'auto'`` and the term cannot be computed. The
+        interior term is left out if `FilmMotion` is the whole derivative.
 
         Raises PathreplayError, before any kernel is launched, if the boundary term is needed and cannot be computed.
         """
@@ -259,7 +261,7 @@ class PathReplayIntegrator(PathIntegrator):
         return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._flow_obstacle(view))
 
     def _flow_obstacle(self, view: Pass) -> str:
-        """Return why the pass needs a film flow, which `pixel_sweep` does not support; "" if it needs none."""
+        """Return why `pixel_sweep` cannot compute the pass if film positions follow surfaces (`SurfaceFlow`), or ""."""
         if self.boundary in ("none", "primary"):
             return ""
         with self._pass_context():

@@ -37,8 +37,8 @@ MOST_A_PIXEL = 2**16
 # Smallest number of samples per pixel in a part with many pixels. Every part repeats the work on the film. With fewer
 # samples per part, this work would take a noticeable fraction of the time.
 LEAST_A_PIXEL = 4
-# Largest number of samples of one call. A call of this size takes minutes on current machines. Calls show no progress
-# and cannot be interrupted.
+# Largest number of samples of one call. A call of this size can take more than an hour. Calls show no progress and
+# cannot be interrupted.
 MOST_IN_ALL = 2**36
 
 

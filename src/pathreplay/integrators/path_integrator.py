@@ -49,8 +49,9 @@ def reached(view: Pass, zero_is_error: bool = False) -> Iterator[None]:
     """Context of a gradient pass: explain `Unreached` errors, and suppress them if the gradient is zero by design.
 
     The gradient is zero by design if only other cameras have gradients (see `unreached_note`). With ``zero_is_error``,
-    the error is also raised if the gradient is zero by design. Attached parameters of another scene can hide the error
-    from the pass. It is therefore raised after the pass if no object of this scene has gradients.
+    the error is also raised in this case. Virtual calls reach the objects of all scenes, so a pass may raise no error
+    because another scene has gradients. The error is then raised after the pass, if no object of this scene has
+    gradients.
     """
     try:
         yield

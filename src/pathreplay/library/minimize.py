@@ -92,14 +92,14 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         problem: the problem. Afterwards its scene has the resulting values.
         optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"``, ``"l-bfgs-b"``,
             ``"levenberg-marquardt"``, or a mapping with ``type`` and options. An optimizer of `mitsuba.ad` must have no
-            variables yet. Its learning rate applies to parameters without a learning rate of their own; schedule and
-            stages scale both. Any other object needs a method ``step(values, gradients, learning_rates, loss) ->
-            values``, with arrays by name. A function needs the interface of `scipy.optimize.minimize`, such as
-            ``functools.partial(scipy.optimize.minimize, method="SLSQP")``. It supports parameters with up to 1000
-            entries in total.
+            variables yet. Its learning rate applies to parameters without a learning rate of their own. The schedule
+            and the stages scale all learning rates. Any other object needs a method ``step(values, gradients,
+            learning_rates, loss) -> values``, with arrays by name. A function needs the interface of
+            `scipy.optimize.minimize`, such as ``functools.partial(scipy.optimize.minimize, method="SLSQP")``. It
+            supports parameters with up to 1000 entries in total.
         steps: number of iterations. Default: ``iterations`` of the problem's job, or 200.
-        callbacks: a function or several, called with an `Iteration` after each step; one that returns True (also of
-            NumPy) stops the loop.
+        callbacks: a function or several, called with an `Iteration` after each step. The loop stops if one returns
+            True (a Python or NumPy boolean).
         progress: show a bar on a terminal, the loss curve and images in a notebook, or lines elsewhere.
         output: run folder for checkpoints, the page of ``pathreplay watch`` and the report. If the folder exists, a
             number is appended. Default: no files are written.

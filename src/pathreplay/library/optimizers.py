@@ -78,7 +78,11 @@ class OfMitsuba:
         return {key: np.array(dr.detach(optimizer[key])).reshape(value.shape) for key, value in values.items()}
 
     def _rate(self, key: str, rate: float) -> float | dr.ArrayBase:
-        """Return the learning rate of a variable, whose learning rate in the problem is now ``rate``."""
+        """Return the learning rate of a variable, for the problem's current ``rate``.
+
+        A parameter with its own learning rate uses ``rate``. All others use the rate of the optimizer, which the
+        problem's schedule and stages scale.
+        """
         if key in self._own:
             return rate
         own_rate, common_rate = self._optimizer.learning_rate(key), self._optimizer.learning_rate()
@@ -202,10 +206,10 @@ def _rated(problem: Problem) -> set[str]:
 def options_of(optimizer: object, known: Optimizer) -> tuple[Json | None, object]:
     """Split the argument ``optimizer`` of `minimize` into options of a job and an object of the user.
 
-    The object is None for a name or a mapping. The options are None for an optimizer object, except that such an object
-    replaces a search, and then gets the options of ``adam``: in a search, all iterations have the same random numbers.
-    Both are None if ``optimizer`` is None. A function gets the options of ``l-bfgs-b``. ``known`` is the optimizer of
-    the problem's job. Raises PathreplayError for any other argument.
+    For a name or a mapping, the object is None. For a function, the options are those of ``l-bfgs-b``. For an object,
+    the options are None: those of the job apply. If the job's optimizer ``known`` is a search, in which all iterations
+    have the same random numbers, the options for an object are those of ``adam``. Both are None if ``optimizer`` is
+    None. Raises PathreplayError for any other argument.
     """
     if optimizer is None or isinstance(optimizer, str):
         return None if optimizer is None else {"type": optimizer}, None

@@ -181,9 +181,10 @@ def _is_uniform_sphere(emitter: mi.Emitter) -> bool:
 def _from_sun(
     emitter: mi.Emitter, center: mi.Point3f, radius: mi.Float, u: mi.Point2f, again: mi.Float
 ) -> tuple[mi.Point3f, mi.Spectrum]:
-    """Return origin and weight of a ray from a directional emitter, for the bounding sphere of the scene.
+    """Return origin and weight of a ray from a directional emitter. The rays cover the bounding sphere of the scene.
 
-    Mitsuba 3.9 hides its own bounding sphere from Dr.Jit. A recorded pass would keep the sphere of the recording.
+    The sphere is an argument, because Mitsuba 3.9 hides its own bounding sphere from Dr.Jit: a recorded pass would keep
+    the sphere that the scene had when the pass was recorded.
     """
     disk = mi.warp.square_to_uniform_disk_concentric(u)
     offset = mi.traverse(emitter)["to_world"] @ mi.Vector3f(disk.x, disk.y, -1)

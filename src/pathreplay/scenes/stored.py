@@ -118,8 +118,9 @@ class Spectra(Form):
 
     def store(self, seen: SceneValue) -> SceneValue:
         S = mi.Vector3f(*_entries(seen, 3))
-        # As in Mitsuba, S is scaled so that its largest entry is one half, because spectra with moderate values are
-        # smooth. Derivatives pass through the limits: a colour that a bound has set to 0 or 1 can leave it again.
+        # As in Mitsuba, a colour with a factor is scaled so that its largest entry is one half, because spectra with
+        # moderate values are smooth. Derivatives ignore the clamping. A colour that a bound has set to 0 or 1 therefore
+        # still receives a gradient.
         factor = mi.Float(1)
         if self.scaled:
             doubled = 2 * dr.max(S)

@@ -83,9 +83,10 @@ def edges_move(trace: TraceConfig, start: Start, at: Arrival) -> bool:
     """Return whether visibility edges may move.
 
     Edges may move if occluders, path vertices or emitters depend on parameters with gradients. The test is that of
-    `path_moves`, with two differences. Texture coordinates and the tangents computed from them do not count, because a
-    texture occludes nothing. A rotation of a projector or spot light counts, because the boundary of the lit region
-    moves although the position of the light does not.
+    `path_moves`, with three differences. Texture coordinates and the tangents computed from them do not count, because
+    a texture occludes nothing. Smooth lobes that are sampled attached do not count, because boundary terms need
+    ``attach='delta'``, where these lobes occur only in scenes without outlines. The rotation and the cutoff angle of a
+    projector or spot light count, because they move the boundary of the lit region.
     """
     lights = [*trace.traits.projectors, *trace.traits.spots]
     turns = trace.attach != "none" and any(with_gradients(light, "to_world", "cutoff_angle") for light in lights)
@@ -101,8 +102,6 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
         if painted:
             surface += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        # For `edges_move`, ``painted`` is False, and smooth lobes that are sampled attached are ignored. Boundary terms
-        # need attach = 'delta'. Smooth lobes are then sampled attached only in scenes without outlines.
         mirrored = [
             bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5), mi.Bool(True))[0].wo
             for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ())

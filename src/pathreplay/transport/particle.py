@@ -90,7 +90,7 @@ def _unoccluded(trace: TraceConfig, v: arrive.Vertex, to: Sighting, active: mi.B
     if not (trace.hide_emitters and trace.traits.area_lights):
         return ~trace.scene.ray_test(ray, active)
     active = active & (v.si.shape.emitter() == None)  # noqa: E711 (an array of pointers)
-    # Behind an emitter, the search continues past the sensor; what it finds there occludes nothing.
+    # `behind_emitters` ignores the end of the ray. Surfaces beyond this end do not occlude the sensor.
     hit = behind_emitters(trace, ray, meet(trace, ray, active), active)
     return active & ~(hit.is_valid() & (hit.t < ray.maxt))
 

@@ -135,7 +135,11 @@ class CameraFlow:
         return self._velocity_of(sample, self._closeness_at(sample.position))
 
     def divergence(self, sample: Sample) -> mi.Float:
-        """Compute the divergence by central differences, at fixed closeness and by closeness."""
+        """Compute the divergence by central differences.
+
+        It is the sum of the divergence at constant closeness, and of the derivative of the velocity with respect to the
+        closeness times the gradient of the closeness.
+        """
         cell, total = Cell.at(sample.position), mi.Float(0)
         corners = cell.corners(self.closeness)
         closeness = interpolated(corners, cell.f)

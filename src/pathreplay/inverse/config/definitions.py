@@ -25,7 +25,8 @@ def defined(job: T, changes: Sequence[str], option: str = "--set") -> T:
         option: name of the command-line option, for messages.
 
     Raises:
-        PathreplayError: an override has no '=', its key is malformed, or the key does not exist in a list or table.
+        PathreplayError: an override has no '=', its key is malformed, an index is outside of its list, or the key
+            continues beyond a value that is neither a list nor a table. Keys that a table lacks are added.
     """
     for change in changes:
         key, equals, text = change.partition("=")

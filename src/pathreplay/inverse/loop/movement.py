@@ -29,11 +29,11 @@ _FIRST = 5
 
 
 def parts_of(array: Array, mean: bool = False) -> list[float]:
-    """Sum an array over up to `MOST_PARTS` contiguous parts, or average it over these parts if ``mean`` is set.
+    """Split an array into up to `MOST_PARTS` contiguous parts, and return the sum of each part, or its ``mean``.
 
     In a sum, independent noise of the entries averages out, and a common signal adds up. Sums are rounded to six digits
-    to keep checkpoints small. Means have nine digits, which tell all numbers in single precision apart: a large value
-    may move in steps of its last digit.
+    to keep checkpoints small. Means have nine digits, which distinguish all numbers in single precision. With fewer
+    digits, small changes of a large value would be lost.
     """
     flat = np.ravel(array)
     if not flat.size:

@@ -87,7 +87,7 @@ def _is_known(sensor: mi.Sensor) -> bool:
 def _constants(sensor: mi.Sensor) -> Hashable:
     """Return what kernels treat as constants of a perspective camera."""
     film, rfilter = sensor.film(), sensor.film().rfilter()
-    # The description of a film rounds the parameters of its filter.
+    # str(film) contains rounded parameters of the filter. The radius and values of the filter are therefore added.
     radius = float(rfilter.radius())
     weights = tuple(rfilter.eval(mi.Float([0, 0.3 * radius, 0.6 * radius])).numpy().tolist())
     numbers = sensor.near_clip(), sensor.far_clip(), sensor.shutter_open(), sensor.shutter_open_time()

@@ -62,7 +62,10 @@ class Transform:
                 )
 
     def bounds(self, lower: float, upper: float) -> tuple[float, float]:
-        """Return the bounds of u for values in [lower, upper]; infinite where the transform itself ends."""
+        """Return the bounds of u for values in [lower, upper].
+
+        A bound at or beyond an end of the range of the transform becomes infinite.
+        """
         low = float(self.latent(np.array([lower], np.float32))[0]) if lower > self.lower else -np.inf
         high = float(self.latent(np.array([upper], np.float32))[0]) if upper < self.upper else np.inf
         return low, high

@@ -26,7 +26,7 @@ class Choices:
 
 
 def field_scene(box: Box, has_sky: bool) -> str:
-    """Return the scene of a density grid that emits light: a box with a medium, and a sky."""
+    """Return the scene of a density grid that emits light: a box with a medium, and a sky if there is one."""
     low, size = box.low, box.size.tolist()
     half, middle = [s / 2 for s in size], box.centre.tolist()
 
@@ -43,7 +43,7 @@ def field_scene(box: Box, has_sky: bool) -> str:
         )
 
     return (
-        "<!-- A medium that absorbs and emits light, in the region that the cameras see, in front of a sky. -->\n"
+        "<!-- A medium that absorbs and emits light, in the region that the cameras see. -->\n"
         '<scene version="3.0.0">\n'
         '  <integrator type="pathreplay">\n'
         '    <integer name="max_depth" value="1"/>\n'
