@@ -129,6 +129,18 @@ def test_images_are_those_of_path(max_depth: int, hide_emitters: bool) -> None:
     assert (ours.mean() > 0) == (max_depth > 0)
 
 
+def test_a_ray_through_a_hidden_lamp_meets_what_is_behind_it() -> None:
+    """A ball: the place on it follows from the distance. Mitsuba's integrators measure it from the lamp's far side."""
+    lamp = {"type": "area", "radiance": {"type": "rgb", "value": 0.0}, "sampling_weight": 0.0}
+    behind = {"type": "sphere", "center": [0, 0, -2], "bsdf": DIFFUSE}
+    sun = {"type": "directional", "direction": [-1, 0, -0.3], "irradiance": {"type": "rgb", "value": 2.0}}
+    scene = {"type": "scene", "camera": camera(fov=30), "behind": behind, "sun": sun}
+    hidden = {**scene, "lamp": {"type": "sphere", "center": [0, 0, 2], "radius": 0.4, "emitter": lamp}}
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2, "hide_emitters": True})
+    images = [np.array(mi.render(mi.load_dict(made), integrator=integrator, seed=1, spp=4)) for made in (scene, hidden)]
+    assert images[0].max() > 0.1 and images[1] == pytest.approx(images[0], abs=1e-4)
+
+
 @pytest.mark.parametrize("max_depth", [0, 1, 3])
 @pytest.mark.parametrize("hide_emitters", [False, True])
 @pytest.mark.parametrize("light", ["sky", "sky and lamp", "lamp"])

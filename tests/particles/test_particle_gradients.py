@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from particle_scenes import ROUGH, dome, mirror, plane, rgb, sensor, slab
+from particle_scenes import ROUGH, dome, milky, mirror, misty, plane, rgb, sensor, slab
 from pathreplay.platform import compat
 from pathreplay.testing.objective import Move, Objective, smooth_weights
 from pathreplay.testing.statistics import gap
@@ -248,6 +248,56 @@ def in_expectation(cell: Mean, plugin: str = PLUGIN) -> tuple[float, float]:
 @pytest.mark.parametrize("cell", MEANS, ids=lambda c: c.name)
 def test_mean_gradients_are_mean_differences(cell: Mean) -> None:
     z, error = in_expectation(cell)
+    assert abs(z) < Z_LIMIT and error < RESOLUTION
+
+
+# ------------------------------ Media ------------------------------
+
+
+def alone(light: str = "spot", kind: str = "grey") -> dict:
+    """A box of fog without floor and ball: nothing in it has an outline."""
+    scene = misty(light, kind)
+    del scene["floor"], scene["ball"]
+    return scene
+
+
+IN_FOG = {"reference": "volpath", "peer": "prbvolpath", "depth": 4, "step": 3e-2, "spp": 512}
+MOVES = {**IN_FOG, "peer": "pathreplay", "depth": 3}  # `prbvolpath` ends the process where a boundary moves
+MIST = "mist.interior_medium"
+SPOT, COLOURED, GRID = (partial(misty, "spot", kind) for kind in ("grey", "coloured", "grid"))
+MEDIA = (
+    mean("density", SPOT, f"{MIST}.sigma_t.value.value", add([1, 1, 1]), **IN_FOG),
+    mean("density, coloured", COLOURED, f"{MIST}.sigma_t.value.value", add([1, 0.5, 0.2]), **IN_FOG),
+    mean("density, grid", GRID, f"{MIST}.sigma_t.data", random(), **IN_FOG),
+    mean("density, hall", partial(misty, around="box"), "sensor.medium.sigma_t.value.value", add([1, 1, 1]), **IN_FOG),
+    mean("albedo", SPOT, f"{MIST}.albedo.value.value", add([1, 0.5, 0.2]), **IN_FOG),
+    mean("phase", COLOURED, f"{MIST}.phase_function.g", add(), **IN_FOG),
+    mean("box moves", alone, "mist.vertex_positions", add(), **MOVES),
+    mean("point moves", partial(alone, "point", "coloured"), "light.position", add([0.3, 0.5, 0.7]), **MOVES),
+    mean("spot moves", partial(alone, "spot", "grid"), "light.to_world", translate(0.3, 0.5, 0.7), **MOVES),
+    mean("camera moves", partial(alone, kind="coloured"), "sensor.to_world", translate(0.3, 0.5, 0.7), **MOVES),
+)
+SPLIT = (
+    mean("milk", milky, "ball.interior_medium.sigma_t.value.value", add([1, 1, 1]), **IN_FOG),
+    mean("air", milky, "ball.exterior_medium.sigma_t.value.value", add([1, 1, 1]), **IN_FOG),
+)
+
+
+@pytest.mark.parametrize(
+    "cell", [pytest.param(c, id=c.name, marks=() if c.name == "density" else pytest.mark.slow) for c in MEDIA]
+)
+def test_gradients_in_media_are_differences_of_volpath(cell: Mean) -> None:
+    z, error = in_expectation(cell)
+    assert abs(z) < Z_LIMIT and error < RESOLUTION
+    with opened(cell) as objective:
+        same = integrator(cell)
+        assert objective.transpose_error(same, same, 1, 16) < TRANSPOSE_MAX
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", SPLIT, ids=lambda c: c.name)
+def test_gradients_of_caustics_in_media_are_differences_of_volpath(cell: Mean) -> None:
+    z, error = in_expectation(replace(cell, options={"caustics": "particles"}), "pathreplay")
     assert abs(z) < Z_LIMIT and error < RESOLUTION
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import particle_scenes
-from particle_scenes import balls, blocks, emitters, images, meter, panel, perturbed, room, sensor
+from particle_scenes import balls, blocks, emitters, images, meter, milky, misty, panel, perturbed, room, sensor
 from pathreplay.particles.film import ParticleFilm
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
@@ -294,6 +294,50 @@ def test_ptracer_is_wrong_where_these_tests_leave_it_out(cell: Cell) -> None:
     if cell.eye != "meter":
         theirs, truth = interior(theirs), interior(truth)
     assert compared(f"ptracer against path: {cell.name}", theirs, truth) > Z_LIMIT
+
+
+# ------------------------------ Media ------------------------------
+
+
+MISTS: dict[str, dict] = {
+    "point, grey": {"light": "point"},
+    "spot, coloured": {"light": "spot", "kind": "coloured"},
+    "sphere, grid": {"light": "sphere", "kind": "grid"},
+    "area, heterogeneous": {"light": "area", "kind": "heterogeneous"},
+    "directional, coloured": {"light": "directional", "kind": "coloured"},
+    "envmap, grey": {"light": "envmap"},
+    "constant, grid": {"light": "constant", "kind": "grid"},
+    "point, in a hall": {"light": "point", "around": "box"},
+    "area, endless": {"light": "area", "around": "endless"},
+}
+QUICK_MISTS = ("spot, coloured", "point, in a hall")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK_MISTS else pytest.mark.slow) for name in MISTS]
+)
+def test_light_paths_in_media_give_the_image_of_volpath(name: str) -> None:
+    scene = mi.load_dict(misty(**MISTS[name]))
+    # `volpath` loses light of lamps close to a null boundary (`test_a_lamp_close_to_a_null_boundary`).
+    reference = "pathreplay" if name == "sphere, grid" else "volpath"
+    assert both(f"media: {name}", scene, "pathreplay_particles", (8, 256), reference=reference) < Z_LIMIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"hide_emitters": True}, {"max_depth": 1}, {"max_depth": 3}], ids=str)
+def test_options_in_media_are_those_of_camera_paths(options: dict) -> None:
+    lamp = {"type": "sphere", "center": [0.7, 0.6, -0.9], "radius": 0.2, "emitter": {"type": "area", "radiance": 5.0}}
+    scene = mi.load_dict(misty("point", lamp=lamp))
+    z = both(f"media: {options}", scene, "pathreplay_particles", (8, 512), reference="pathreplay", **options)
+    assert z < Z_LIMIT
+
+
+@pytest.mark.parametrize("light", ["area", pytest.param("sphere", marks=pytest.mark.slow)])
+def test_caustics_in_media_complete_the_image(light: str) -> None:
+    reference = "volpath" if light == "area" else "pathreplay"  # the ball is close to a null boundary
+    z = both(f"media, caustics: {light}", mi.load_dict(milky(light)), "pathreplay", (8, 512), reference=reference,
+             caustics="particles")  # fmt: skip
+    assert z < Z_LIMIT
 
 
 # ------------------------------ Caustics by light paths ------------------------------

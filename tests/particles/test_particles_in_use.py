@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pathreplay
-from particle_scenes import HEIGHT, WIDTH, balls, dome, images, meter, panel, room, sensor, slab
+from particle_scenes import HEIGHT, WIDTH, balls, dome, images, meter, misty, panel, room, sensor, slab
 from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.cli import app
 from pathreplay.inverse.config.schema import make_config
@@ -93,12 +93,7 @@ def weighted(scene: mi.Scene, plugin: dict, spp: int = 16, seed: int = 2) -> flo
 
 SMALL = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
 CHECKERS = {"type": "checkerboard"}
-FOG = {"type": "homogeneous", "albedo": 0.5}
 REFUSED: dict[str, tuple[Callable[[], dict], str]] = {
-    "medium": (
-        lambda: room(fog={"type": "cube", "bsdf": {"type": "null"}, "interior": FOG}),
-        "light paths do not pass through media yet: remove the media from the scene, or trace all paths",
-    ),
     "radiancemeter": (
         lambda: room(eye={"type": "radiancemeter", "id": "eye", "film": SMALL}),
         "light paths cannot be connected to sensor 'eye' of class RadianceMeter: take perspective",
@@ -126,6 +121,14 @@ def test_what_light_paths_cannot_render_is_refused_in_one_line(case: str, plugin
     with pytest.raises(PathreplayError) as caught:
         mi.load_dict(plugin).render(made, spp=1)
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_media_that_emit_are_refused_in_one_line() -> None:
+    glow = {"type": "gridmedium", "albedo": 0.5, "sigma_t": 1.0, "radiance": 2.0}
+    made = mi.load_dict(room(fog={"type": "cube", "bsdf": {"type": "null"}, "interior": glow}))
+    with pytest.raises(PathreplayError, match="no light path can start in a medium that emits: set its radiance to 0"):
+        mi.load_dict(PARTICLES).render(made, spp=1)
+    assert np.isfinite(np.array(mi.load_dict(CAUSTICS).render(made, spp=1))).all()  # camera paths find its light
 
 
 SPECTRA = """
@@ -297,6 +300,14 @@ def test_edges_that_light_paths_leave_out_are_told(plugin: dict, more: dict, lef
     told = [line for line in log if "the gradient of light paths leaves out" in line]
     assert len(told) == bool(left_out), log
     assert all(f"'light.position' moves, and the gradient of light paths leaves out {left_out}: " in t for t in told)
+
+
+@BOTH
+def test_edges_that_light_paths_in_media_leave_out_are_told(plugin: dict, log: list[str]) -> None:
+    gradient(loaded(misty()), {**plugin, "boundary": "auto"}, "light.position", 4)
+    assert any(
+        "'light.position' moves, and the gradient of light paths leaves out moving edges" in line for line in log
+    )
 
 
 def test_edges_in_the_light_of_a_projector_are_told(log: list[str]) -> None:

@@ -263,6 +263,54 @@ def balls(*materials: str, light: str = "area", mesh: bool = False, instances: b
     return {**parts, **more}
 
 
+# ------------------------------ Media ------------------------------
+
+
+def fog(kind: str = "grey") -> dict:
+    """A medium: `grey`, `coloured` (scatters forwards), `grid` or `heterogeneous`, in the box of `misty`."""
+    own = {"albedo": rgb(0.8, 0.6, 0.5)}
+    if kind in ("grey", "coloured"):
+        forward = {"phase": {"type": "hg", "g": 0.5}} if kind == "coloured" else {}
+        colour = rgb(0.9, 0.6, 0.3) if forward else rgb(0.5, 0.5, 0.5)
+        return {"type": "homogeneous", "sigma_t": colour, **own, **forward}
+    density = np.random.default_rng(3).uniform(0, 1.5, (4, 4, 4, 1)).astype(np.float32)
+    place = mi.ScalarTransform4f().translate([-1.2, 0.1, -1.2]).scale([2.4, 1.6, 2.4])
+    volume = {"type": "gridvolume", "grid": mi.VolumeGrid(density), "to_world": place, "raw": True}
+    return {"type": {"grid": "gridmedium"}.get(kind, kind), "sigma_t": volume, **own}
+
+
+def misty(light: str = "point", kind: str = "grey", around: str = "", **more: Any) -> dict:
+    """A ball in a box of fog over a floor; all emitters are outside of the box.
+
+    ``around`` puts camera and emitter into a second fog: "endless", or in a large "box".
+    """
+    T = mi.ScalarTransform4f
+    scene = balls(light=light)
+    scene["mist"] = {
+        "type": "cube", "to_world": T().translate([0, 0.9, 0]) @ T().scale([1.2, 0.8, 1.2]),
+        "bsdf": {"type": "null"}, "interior": fog(kind),
+    }  # fmt: skip
+    scene["ball"] = round_mesh(80, 0.4, (-0.5, 0.7, 0.1), {"type": "roughplastic", "alpha": 0.3})
+    if around:
+        thin = {"type": "ref", "id": "thin"}
+        scene["thin"] = {"type": "homogeneous", "sigma_t": rgb(0.1, 0.2, 0.1), "albedo": rgb(0.5, 0.7, 0.9)}
+        scene["sensor"]["medium"], scene["mist"]["exterior"] = thin, thin
+        if around == "box":
+            room = {"type": "cube", "to_world": T().translate([0, 3, 0]).scale(6), "bsdf": {"type": "null"}}
+            scene["hall"] = {**room, "interior": thin}
+    return {**scene, **more}
+
+
+def milky(light: str = "area") -> dict:
+    """A ball of glass full of milk, and a caustic in the fog and on the floor beside it."""
+    milk = {**fog("grey"), "scale": 3.0}
+    ball = {"type": "sphere", "center": [0.4, 0.75, -0.2], "radius": 0.35, "bsdf": {"type": "dielectric"}}
+    lens = {**ball, "center": [-0.5, 1.2, 0.2]}
+    scene, air = misty(light, lens=lens, air=fog("grey")), {"type": "ref", "id": "air"}
+    scene["ball"], scene["mist"]["interior"] = {**ball, "interior": milk, "exterior": air}, air
+    return scene
+
+
 # ------------------------------ Images ------------------------------
 
 

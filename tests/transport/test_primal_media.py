@@ -290,6 +290,43 @@ def test_picture_against_volpath(spec: Picture) -> None:
     assert ours.z < Z_LIMIT, ours
 
 
+# ------------------------------ Boundaries: the same medium with and without ------------------------------
+
+
+def walled(walls: bool, lamp: dict) -> dict:
+    """Fog in the box [-1, 1]³: inside a null boundary, or as a grid that ends there, around the sensor."""
+    scene = {"type": "scene", "camera": camera(fov=30), "lamp": lamp}
+    scene["camera"]["film"]["pixel_format"] = "rgba"
+    if walls:
+        return {**scene, "box": {"type": "cube", "bsdf": NULL, "interior": homogeneous(0.5, 0.8)}}
+    scene["fog"] = heterogeneous(np.full((2, 2, 2, 1), 0.5), 0.8, plugin="gridmedium")
+    scene["camera"]["medium"] = {"type": "ref", "id": "fog"}
+    return scene
+
+
+def walls_matter(lamp: dict, plugin: str = "pathreplay", **options: Any) -> float:
+    images = [
+        pictures(mi.load_dict(walled(walls, lamp)), plugin, 1 + 100 * walls, max_depth=2, **options)
+        for walls in (False, True)
+    ]
+    return compare(*images).z
+
+
+def test_a_lamp_close_to_a_null_boundary() -> None:
+    """A shadow ray that the boundary shifts sideways would meet the lamp before its end, as those of `volpath` do."""
+    T = mi.ScalarTransform4f
+    place = T().translate([0, 1.01, 0]) @ T().rotate([1, 0, 0], 90) @ T().scale(0.6)
+    lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": rgb(9, 9, 9)}}
+    assert walls_matter(lamp, hide_emitters=True) < Z_LIMIT
+    assert walls_matter(lamp, "volpath") > 2 * Z_LIMIT
+
+
+def test_the_length_of_a_ray_through_a_hidden_lamp() -> None:
+    """Light from above, and fog and walls behind a hidden ball."""
+    ball = {"type": "sphere", "radius": 0.6, "emitter": {"type": "area", "radiance": rgb(4, 4, 4)}}
+    assert walls_matter(ball, hide_emitters=True) < Z_LIMIT
+
+
 # ------------------------------ Emission: closed forms, since volpath has none ------------------------------
 
 # A furnace: where Q = (1 - A) σ_t L and the sky is L, the radiance is L everywhere, whatever the density.

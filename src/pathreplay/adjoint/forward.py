@@ -34,7 +34,7 @@ def forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> t
     ray0 = path.at.ray
     valid = mi.Bool(trace.background_is_opaque) & path.active
     moves = path_moves(trace, start, path.at)
-    branch = Branch.none()
+    branch = Branch.none(trace)
 
     while dr.hint(path.active, exclude=[trace, moves, lost], label="pathreplay: forward"):
         u, step = path.choose(trace, sampler)

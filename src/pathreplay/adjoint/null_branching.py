@@ -35,11 +35,13 @@ class Branch:
     number: mi.Float  # number of null collisions so far
     depth: mi.UInt32  # number of vertices before the collision
     η: mi.Float  # product of the relative indices of refraction along the path
+    scattered: mi.Bool  # `Arrival.scattered` after the collision; None unless caustics are omitted
 
     @staticmethod
-    def none() -> Branch:
-        o, d, black = mi.Point3f(0), mi.Vector3f(0), mi.Spectrum(0)
-        return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, mi.Float(0), mi.Float(0), mi.UInt32(0), mi.Float(1))
+    def none(trace: TraceConfig) -> Branch:
+        o, d, black, zero = mi.Point3f(0), mi.Vector3f(0), mi.Spectrum(0), mi.Float(0)
+        no: mi.Bool = mi.Bool(False) if trace.without_caustics else None  # type: ignore[assignment]
+        return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, zero, mi.Float(0), mi.UInt32(0), mi.Float(1), no)
 
     def offer(self, path: PathState, step: SampledStep) -> Branch:
         """Offer the null collision of a step to the reservoir. Its resampling weight is `NullCollision.mass`."""
@@ -50,7 +52,10 @@ class Branch:
         weight, bare = mi.Spectrum(path.β * null.ω), mi.Spectrum(path.β * null.bare)
         number = self.number + dr.select(active, null.number, 0)
         p, medium = mi.Point3f(ray.o + null.t * ray.d), path.at.medium
-        offered = Branch(p, ray.d, medium, weight, bare, mass, number, path.depth, path.η)
+        scattered = self.scattered
+        if scattered is not None:
+            scattered = path.at.scattered | (path.at.camera & medium.use_emitter_sampling())
+        offered = Branch(p, ray.d, medium, weight, bare, mass, number, path.depth, path.η, scattered)
         return replace(dr.select(taken, offered, self), mass=mass, number=number)
 
 
@@ -73,7 +78,8 @@ def branch_term(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ra
     active = branch.mass > 0
     with dr.suspend_grad():
         ray, hit = mi.Ray3f(branch.p, branch.d, ray.time, ray.wavelengths), dr.zeros(mi.PreliminaryIntersection3f)
-        at = Arrival(ray, hit, mi.Float(1), mi.Bool(True), mi.Bool(False), branch.medium, mi.Float(0))
+        no, scattered = mi.Bool(False), branch.scattered
+        at = Arrival(ray, hit, mi.Float(1), mi.Bool(True), no, branch.medium, mi.Float(0), scattered)
         one = mi.Spectrum(1)
         flight = Flight(event=active, t=mi.Float(0), density=mi.Float(1), W=one, along=mi.Float(0), σ_s=one)
         u = VertexSamples.draw(sampler)

@@ -80,7 +80,7 @@ def _replay_still(trace: TraceConfig, start: CameraStart, path: PathState, δL: 
     """
     sampler, ray0 = start.sampler, path.at.ray
     L = path_radiance(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, updated at each vertex
-    branch = Branch.none()
+    branch = Branch.none(trace)
 
     while dr.hint(path.active, exclude=[trace], label="pathreplay: replay"):
         u, step = path.choose(trace, sampler)

@@ -39,7 +39,7 @@ def record_path(
     trace = replace(trace, background_apart=layout.fixed)
     L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance of the path so far; radiance from the environment
     count = mi.UInt32(0)  # number of vertices and null boundaries
-    branch, left = Branch.none(), mi.Bool(False)
+    branch, left = Branch.none(trace), mi.Bool(False)
     if dr.hint(trace.background_apart, mode="scalar"):
         path, left = path.leave()
 

@@ -259,13 +259,13 @@ class ObserverVertex:
 
     def arrival(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, pdf: mi.Float) -> Arrival:
         """Return the arrival at ``hit`` of a path that continues from the observer along ``ray``."""
-        at = Arrival(ray, hit, pdf, mi.Bool(False), mi.Bool(False))
+        unsampled = mi.Bool(False)
+        if self.trace.media is not None:
+            unsampled = self.event & ~self.at.medium.use_emitter_sampling()
+        at = Arrival(ray, hit, pdf, unsampled, mi.Bool(False))
         if self.trace.without_caustics:
-            at.scattered = self.at.camera | self.at.scattered
-        if self.trace.media is None:
-            return at
-        unsampled = self.event & ~self.at.medium.use_emitter_sampling()
-        return replace(at, delta=unsampled, medium=self.medium(ray.d), behind=mi.Float(0))
+            at.scattered = self.at.scattered | (self.at.camera & ~unsampled)
+        return at if self.trace.media is None else replace(at, medium=self.medium(ray.d), behind=mi.Float(0))
 
     def transmittance_past_edge(
         self, light: mi.DirectionSample3f, t: mi.Float, key: mi.UInt32, active: mi.Bool
@@ -312,4 +312,4 @@ def arrival_beyond(trace: TraceConfig, at: Arrival, t: mi.Float, medium: mi.Medi
         hit = behind_emitters(trace, ray, hit, active & at.camera)
     ahead = is_boundary(trace, hit, ray, active) & (hit.t < known.t)
     behind = (known.t <= 0) | is_boundary(trace, at.hit, at.ray, active)
-    return Arrival(ray, dr.select(ahead | behind, hit, known), at.pdf, at.delta, at.camera, medium, t)
+    return replace(at, ray=ray, hit=dr.select(ahead | behind, hit, known), medium=medium, behind=t)

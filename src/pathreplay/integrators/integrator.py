@@ -131,13 +131,14 @@ class PathReplayIntegrator(PathIntegrator):
     def _light_terms(self, view: Pass, trace: TraceConfig) -> tuple[Term, ...]:
         """Return the terms of light paths; empty if there are none.
 
-        The boundary term is left out as the boundary term of camera paths is (see `_needs_edges`), and with
-        ``boundary = 'primary'``.
+        The boundary term is left out as the boundary term of camera paths is (see `_needs_edges`), with
+        ``boundary = 'primary'``, and in scenes with media.
         """
         if self.particles is None:
             return ()
         edges = ParticleBoundary(self.particles, self.boundary_spp)
-        if self.boundary in ("none", "primary") or not self._needs_edges(view, edges.move(view, trace)):
+        left_out = self.boundary in ("none", "primary") or trace.media is not None
+        if left_out or not self._needs_edges(view, edges.move(view, trace)):
             return (self.particles,)
         Boundary.require(view, self.boundary_spp)
         return self.particles, edges
@@ -162,10 +163,7 @@ class PathReplayIntegrator(PathIntegrator):
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
         """Build the trace configuration of camera paths, which omit caustics if light paths estimate caustics."""
         trace = PathIntegrator._trace_config(self, scene, sensor, state)
-        if self.particles is None:
-            return trace
-        self.particles.require_no_media(trace)
-        return replace(trace, without_caustics=True)
+        return trace if self.particles is None else replace(trace, without_caustics=True)
 
     def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         if self.particles is None:
@@ -393,7 +391,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
         if self.particles is not None and result.moves:
-            edges = self.boundary in ("auto", "all")
+            edges = self.boundary in ("auto", "all") and trace.media is None
             omitted = ParticleBoundary(self.particles).notes(view.scene) if edges else None
             for note in particle_notes(trace, view.sensor, omitted):
                 self._warn_once(note)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import reduce
 from operator import add
@@ -81,7 +81,6 @@ class PathIntegrator(Unlearned):
     interior: Term
     max_depth: int  # this member and the next two belong to Mitsuba's integrator
     rr_depth: int
-    skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
 
     def __init__(self, props: mi.Properties) -> None:
         if mi.is_polarized:
@@ -277,7 +276,6 @@ class PathIntegrator(Unlearned):
             hide_emitters=self.hide_emitters,
             max_depth=self.max_depth,
             rr_depth=self.rr_depth,
-            skip_area_emitters=self.skip_area_emitters,
         )
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:

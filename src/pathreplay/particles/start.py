@@ -14,6 +14,7 @@ from pathreplay.transport.emitters import area_growth
 from pathreplay.transport.facts.nodes import is_mesh
 from pathreplay.transport.meet import meet
 from pathreplay.transport.vertex import Arrival, TraceConfig, reciprocal
+from pathreplay.transport.volume.passage import medium_at_origin
 
 #: Classes of emitters that can emit rays.
 EMITTERS = frozenset(
@@ -256,7 +257,10 @@ class EmitterStart:
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
         ray, _ = dr.detach(self.emit())
         hit = meet(trace, ray, active)
-        return Arrival(ray=mi.Ray3f(ray), hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
+        at = Arrival(ray=mi.Ray3f(ray), hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
+        if trace.media is not None:
+            at.medium, at.behind = medium_at_origin(trace, ray, hit, active), mi.Float(0)
+        return at
 
     def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:
         ray, _ = self.emit()

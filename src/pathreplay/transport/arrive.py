@@ -16,7 +16,7 @@ from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.emitters import emission, vertex_glow
 from pathreplay.transport.facts.traits import is_null
 from pathreplay.transport.surface import met, steady
-from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexRecord
+from pathreplay.transport.vertex import Arrival, Flight, Signature, TraceConfig, VertexRecord
 from pathreplay.transport.volume.flight import Flown, fly, fly_again
 from pathreplay.transport.volume.media import interaction
 
@@ -33,6 +33,13 @@ class Vertex:
     inside: InMedium = None  # type: ignore[assignment]  # None in scenes without media
     n: mi.Vector3f = None  # type: ignore[assignment]  # differentiable geometric normal in the shading frame; None on camera paths
 
+    def signature(self, at: Arrival, lobe: mi.UInt32, go_on: mi.Bool) -> Signature:
+        """Return the discrete choices at the vertex. ``go_on`` is False at the last vertex of a path."""
+        met, shape = self.si.is_valid(), dr.reinterpret_array(mi.UInt32, at.hit.shape)
+        if self.inside is not None:
+            met, shape = self.surface | (self.inside.event & go_on), dr.select(self.inside.event, 0, shape)
+        return Signature(met, shape, lobe)
+
 
 @dataclass
 class InMedium:
@@ -40,11 +47,17 @@ class InMedium:
 
     event: mi.Bool  # the flight ended at a real collision in the medium
     through: mi.Bool  # the ray ended at a null boundary, which transmits all light and does not count as a vertex
+    around: mi.MediumPtr  # the medium through which the path arrived
     mei: mi.MediumInteraction3f
     phase: mi.PhaseFunctionPtr
     flight: Flight
     w: mi.Spectrum  # weight of the radiance from the vertex: flight.W, multiplied by σ_s / density if ``event``
     e: mi.Spectrum  # radiance emitted by the medium along the flight
+
+    def medium(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.MediumPtr:
+        """Return the medium along a ray that leaves the vertex in direction ``d``. ``si`` is the vertex's surface."""
+        turns = ~self.event & si.is_valid() & si.is_medium_transition()
+        return dr.select(turns, si.target_medium(d), self.around)
 
 
 def choose(
@@ -135,12 +148,10 @@ def _in_medium(
     bsdf, phase = si.bsdf(at.ray), at.medium.phase_function()
     surface = active & ~event & si.is_valid()
     through = surface & is_null(bsdf)
-    seen = active & ~event
-    if trace.hide_emitters:
-        seen &= ~at.camera | si.is_valid()
+    seen = sees_lights(trace, at, si, active & ~event)
     origin = dr.zeros(mi.Interaction3f)
     origin.t, origin.time, origin.wavelengths = mi.Float(0), at.ray.time, at.ray.wavelengths
     origin.p = dr.select(event, flown.mei.p, si.p)
     origin.n = dr.select(event, 0, si.n)
-    inside = InMedium(event, through, flown.mei, phase, flight, flown.w, flown.e)
-    return Vertex(si, bsdf, surface & ~through, origin, emission(trace.scene, at, si, attached, seen), inside)
+    inside = InMedium(event, through, at.medium, flown.mei, phase, flight, flown.w, flown.e)
+    return Vertex(si, bsdf, surface & ~through, origin, vertex_glow(trace, at, si, attached, seen), inside)

@@ -35,12 +35,10 @@ class Connection:
         return self.Le * (mis if attached else dr.detach(mis))
 
 
-def choose(
-    trace: TraceConfig, v: Vertex, medium: mi.MediumPtr, u: VertexSamples, sampler: Sampler, go_on: mi.Bool
-) -> Connection:
+def choose(trace: TraceConfig, v: Vertex, u: VertexSamples, sampler: Sampler, go_on: mi.Bool) -> Connection:
     """Sample an emitter at vertices that support next-event estimation, and test visibility. Detached.
 
-    With media, a shadow ray estimates the transmittance. ``medium`` is the medium through which the path arrived.
+    With media, a shadow ray estimates the transmittance.
     """
     if v.inside is None:
         lit = go_on & v.surface & is_smooth(v.bsdf)
@@ -48,16 +46,11 @@ def choose(
         return Connection(light, Le, lit & (light.pdf != 0))
     event = v.inside.event
     lit = go_on & (v.surface | event)
-    lit &= dr.select(event, medium.use_emitter_sampling(), is_smooth(v.bsdf))
+    lit &= dr.select(event, v.inside.around.use_emitter_sampling(), is_smooth(v.bsdf))
     light, Le = draw_emitter(trace.scene, v.origin, u.light, lit, visible=False)
     lit &= light.pdf != 0
-    dark = shadow(trace, v.origin.spawn_ray_to(light.p), shadow_start(v, light, medium), sampler, lit)
+    dark = shadow(trace, v.origin.spawn_ray_to(light.p), v.inside.medium(v.si, light.d), sampler, lit)
     return Connection(light, Le * dark.T, lit & dr.any(dark.T != 0), dark)
-
-
-def shadow_start(v: Vertex, light: mi.DirectionSample3f, medium: mi.MediumPtr) -> mi.MediumPtr:
-    """Return the medium in which a shadow ray starts; ``medium`` is the medium through which the path arrived."""
-    return dr.select(v.surface & v.si.is_medium_transition(), v.si.target_medium(light.d), medium)
 
 
 def repeat(trace: TraceConfig, v: Vertex, again: VertexRecord, ctx: mi.BSDFContext, attached: bool) -> mi.Spectrum:

@@ -120,11 +120,15 @@ def have_gradients(scene: mi.Scene, *kinds: type[mi.Object]) -> bool:
 
 
 def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
-    """Return whether the weight of scattering at a surface depends on parameters with gradients.
+    """Return whether the weights of a path depend on parameters with gradients.
 
     The result is valid only if `path_moves` is False. ``at`` is the first arrival. As later passes do, the function
-    records the weight of a lobe symbolically. It then checks whether the weight has gradients. Nothing is evaluated.
+    records the weight of a lobe symbolically. It then checks whether the weight has gradients. Media count if a
+    parameter of a medium has gradients. Nothing is evaluated.
     """
+    media = [node for node in nodes_of(trace.scene) if isinstance(node, mi.Medium)]
+    if any(map(may_have_gradients, set().union(media, *map(nodes_of, media)))):
+        return True
     lobe, valid = at.hit.prim_index, at.hit.is_valid()  # arrays whose values Dr.Jit does not know while it traces
     si = at.hit.compute_surface_interaction(at.ray, compat.shading(), valid)
     v = Vertex(si, si.bsdf(at.ray), valid, si, mi.Spectrum(0))

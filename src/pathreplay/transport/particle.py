@@ -18,8 +18,8 @@ from pathreplay.transport.start import behind_emitters
 from pathreplay.transport.surface import normal_in_frame
 from pathreplay.transport.vertex import (
     Arrival,
+    SampledInMedia,
     SampledStep,
-    Signature,
     Splat,
     Step,
     TraceConfig,
@@ -27,38 +27,52 @@ from pathreplay.transport.vertex import (
     VertexSamples,
     is_smooth,
 )
+from pathreplay.transport.volume.shadow import shadow, shadow_again
 
 
 def choose_step(
-    trace: TraceConfig, at: Arrival, u: VertexSamples, sampler: Sampler, go_on: mi.Bool, active: mi.Bool
+    trace: TraceConfig,
+    at: Arrival,
+    β: mi.Spectrum,
+    u: VertexSamples,
+    sampler: Sampler,
+    go_on: mi.Bool,
+    active: mi.Bool,
 ) -> SampledStep:
     """Sample a step, and test whether the sensor sees the vertex. Nothing is differentiated.
 
     At the last vertex, ``go_on`` is False, and the path is connected but not continued. If
     ``trace.to_sensor.caustics``, the first vertex is not connected, and only delta lobes continue the path after the
-    first vertex.
+    first vertex. With media, the throughput ``β`` affects the flight to the vertex (see `fly`), and the connection to
+    the sensor has a transmittance.
     """
     link, ctx = _link(trace), mi.BSDFContext(mi.TransportMode.Importance)
-    v = arrive.choose(trace, at, sampler, mi.Spectrum(1), active)
+    v = arrive.choose(trace, at, sampler, β, active)
     to = _sight(link, v, u, active)
-    lit = active & v.surface & is_smooth(v.bsdf) & to.valid
+    lit = active & to.valid & _connects(trace, v)
     if link.caustics:
         lit &= ~at.camera
     sampled = scatter.choose(trace, v, at, u, ctx, to.d, lit, active)
-    c = sampled.f * to.W
+    c, w, kept, medium = sampled.f * to.W, sampled.w, sampled.kept, at.medium
     lit &= dr.any(c != 0)
-    lit &= _unoccluded(trace, v, to, lit)
-    going = sampled.active & go_on
+    going, first = sampled.active & go_on, at.camera
+    if v.inside is None:
+        lit &= _unoccluded(trace, v, to, lit)
+    else:
+        dark = shadow(trace, v.origin.spawn_ray_to(to.end), v.inside.medium(v.si, to.d), sampler, lit)
+        lit &= dr.any(dark.T != 0)
+        kept.media = SampledInMedia(sampled.null, v.inside.flight, dark)
+        c, w, medium = v.inside.w * dark.T * c, v.inside.w * w, v.inside.medium(v.si, kept.d)
+        going, first = sampled.active & (go_on | sampled.null), first & ~sampled.null
     if link.caustics:
-        going &= ~at.camera | sampled.kept.delta
-    kept = sampled.kept
+        going &= ~first | kept.delta
     kept.lit = lit
     splat = Splat(dr.select(lit, c, 0), to.s)
-    ray_next = v.origin.spawn_ray(kept.d)
-    signature = _signature(v, at, kept.lobe)
-    no = mi.Bool(False)
-    e = _weighted(link, splat, at, lit)
-    return SampledStep(e, sampled.w, ray_next, kept.pdf, signature, kept, mi.Float(1), no, going, splat=splat)
+    e, signature = _weighted(link, splat, at, lit), v.signature(at, kept.lobe, go_on)
+    return SampledStep(
+        e, w, v.origin.spawn_ray(kept.d), kept.pdf, signature, kept, mi.Float(1), sampled.null, going, medium,
+        splat=splat,
+    )  # fmt: skip
 
 
 def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Step:
@@ -68,10 +82,12 @@ def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active:
     with dr.suspend_grad(when=not attached):
         to = _sight(link, v, again.u, lit)
         v.n = normal_in_frame(again.at.hit, again.at.ray, v.si, active)
-    f, _ = scatter.towards(v, ctx, to.d, lit)
-    splat = Splat(dr.select(lit, f * to.W, 0), to.s)
-    w, d, pdf = scatter.repeat(trace, v, again, ctx, attached)
-    signature = _signature(v, again.at, again.kept.lobe)
+    c, (w, d, pdf) = scatter.towards(v, ctx, to.d, lit)[0] * to.W, scatter.repeat(trace, v, again, ctx, attached)
+    if v.inside is not None:
+        T = shadow_again(trace, v.origin.spawn_ray_to(to.end), again.kept.media.shadow, attached, lit)
+        c, w = v.inside.w * T * c, v.inside.w * w
+    splat = Splat(dr.select(lit, c, 0), to.s)
+    signature = v.signature(again.at, again.kept.lobe, again.go_on)
     return Step(_weighted(link, splat, again.at, lit), w, v.origin.spawn_ray(d), pdf, signature, splat=splat)
 
 
@@ -84,12 +100,23 @@ def _sight(link: SensorLink, v: arrive.Vertex, u: VertexSamples, active: mi.Bool
     return link.sight(v.origin, u.light, active)
 
 
+def _connects(trace: TraceConfig, v: arrive.Vertex) -> mi.Bool:
+    """Return whether a vertex may be connected to the sensor: it scatters smoothly, and is not on a hidden emitter."""
+    connects = v.surface & is_smooth(v.bsdf)
+    if trace.hide_emitters and trace.traits.area_lights:
+        connects &= v.si.shape.emitter() == None  # noqa: E711 (an array of pointers)
+    if v.inside is None:
+        return connects
+    # In a medium without emitter sampling, a collision counts as a delta lobe where caustics are set apart.
+    event = v.inside.event & v.inside.around.use_emitter_sampling() if _link(trace).caustics else v.inside.event
+    return connects | event
+
+
 def _unoccluded(trace: TraceConfig, v: arrive.Vertex, to: Sighting, active: mi.Bool) -> mi.Bool:
-    """Test whether the sensor sees a vertex. With ``hide_emitters``, area emitters are hidden and occlude nothing."""
+    """Test whether the sensor sees a vertex. With ``hide_emitters``, area emitters occlude nothing."""
     ray = v.origin.spawn_ray_to(to.end)
     if not (trace.hide_emitters and trace.traits.area_lights):
         return ~trace.scene.ray_test(ray, active)
-    active = active & (v.si.shape.emitter() == None)  # noqa: E711 (an array of pointers)
     # `behind_emitters` ignores the end of the ray. Surfaces beyond this end do not occlude the sensor.
     hit = behind_emitters(trace, ray, meet(trace, ray, active), active)
     return active & ~(hit.is_valid() & (hit.t < ray.maxt))
@@ -100,7 +127,3 @@ def _weighted(link: SensorLink, splat: Splat, at: Arrival, lit: mi.Bool) -> mi.S
     if link.adjoint is None:
         return mi.Spectrum(0)
     return dr.select(lit, splat.c * link.adjoint(splat.s, at.ray.wavelengths, lit), 0)
-
-
-def _signature(v: arrive.Vertex, at: Arrival, lobe: mi.UInt32) -> Signature:
-    return Signature(v.si.is_valid(), dr.reinterpret_array(mi.UInt32, at.hit.shape), lobe)

@@ -119,14 +119,14 @@ def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.
     hit = meet(trace, ray, active)
     if trace.skips_null:
         hit = skip_null(trace, ray, hit, active)
+    scattered = at.scattered
+    if trace.without_caustics:
+        scattered = dr.select(at.camera, ~kept.delta if trace.media is None else ~(kept.delta | null), at.scattered)
     if trace.media is None:
-        onward = Arrival(ray=ray, hit=hit, pdf=kept.pdf, delta=kept.delta, camera=mi.Bool(False))
-        if trace.without_caustics:
-            onward.scattered = dr.select(at.camera, ~kept.delta, at.scattered)
-        return onward
+        return Arrival(ray, hit, kept.pdf, kept.delta, mi.Bool(False), scattered=scattered)
     camera = null & at.camera
-    if trace.hide_emitters:
+    if trace.hide_emitters and trace.to_sensor is None:
         hit = behind_emitters(trace, ray, hit, active & camera)
     pdf, delta = dr.select(null, at.pdf, kept.pdf), dr.select(null, at.delta, kept.delta)
     behind = dr.select(null, at.behind + dr.norm(ray.o - at.ray.o), 0)
-    return Arrival(ray, hit, pdf, delta, camera, step.medium, behind)
+    return Arrival(ray, hit, pdf, delta, camera, step.medium, behind, scattered)

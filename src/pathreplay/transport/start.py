@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
-from pathreplay.transport.meet import meet, short_of_end
+from pathreplay.transport.meet import meet
 from pathreplay.transport.vertex import Arrival, TraceConfig
 from pathreplay.transport.volume.passage import skip_null
 
@@ -59,17 +59,25 @@ class CameraStart:
         return self.ray.o, self.ray.d
 
 
+@dr.syntax
 def behind_emitters(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """Return the first hit that is not on an area emitter. Its distance is measured from the origin of ``ray``."""
-    passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
-    si = hit.compute_surface_interaction(ray, compat.minimal(), passed)
-    onward = si.spawn_ray(ray.d)
-    behind = short_of_end(trace, onward, trace.skip_area_emitters(trace.scene, onward, True, passed), passed)
-    behind.t += dr.norm(onward.o - ray.o)
-    hit[passed] = behind
-    return hit
+    """Return the first hit that is not on an area emitter. Its distance is measured from the origin of ``ray``.
+
+    Mitsuba's ``skip_area_emitters`` measures the distance from the last emitter instead.
+    """
+    here, onward, gone = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(0)
+    passing = active & here.is_valid() & (here.shape.emitter() != None)  # noqa: E711 (an array of pointers)
+    while dr.hint(passing, exclude=[trace], label="pathreplay: behind emitters"):
+        si = here.compute_surface_interaction(onward, compat.minimal(), passing)
+        behind = si.spawn_ray(onward.d)
+        gone += dr.norm(behind.o - onward.o)
+        onward = behind
+        here = meet(trace, onward, passing)
+        passing &= here.is_valid() & (here.shape.emitter() != None)  # noqa: E711
+    here.t += gone
+    return here
 
 
 def medium_around(trace: TraceConfig) -> mi.MediumPtr:

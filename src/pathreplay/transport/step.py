@@ -20,7 +20,6 @@ from pathreplay.transport.vertex import (
     Lighting,
     SampledInMedia,
     SampledStep,
-    Signature,
     Step,
     TraceConfig,
     VertexRecord,
@@ -55,10 +54,10 @@ def choose_step(
     """
     at, go_on, active = visit.at, visit.go_on, visit.active
     if trace.to_sensor is not None:
-        return particle.choose_step(trace, at, u, sampler, go_on, active)
+        return particle.choose_step(trace, at, visit.β, u, sampler, go_on, active)
     ctx = mi.BSDFContext() if ctx is None else ctx
     v = arrive.choose(trace, at, sampler, visit.β, active, flight)
-    link = connect.choose(trace, v, at.medium, u, sampler, go_on)
+    link = connect.choose(trace, v, u, sampler, go_on)
     to = scatter.choose(trace, v, at, u, ctx, link.light.d, link.lit, go_on)
     reached = link.reaches(to.pdf_light, False)
     kept, e, w, medium = to.kept, v.glow + dr.select(link.lit, to.f * reached, 0), to.w, at.medium
@@ -67,15 +66,14 @@ def choose_step(
     if v.inside is not None:
         kept.media = SampledInMedia(to.null, v.inside.flight, link.shadow)
         e, w = v.inside.e + v.inside.w * e, v.inside.w * w
-        crossed = (v.surface | v.inside.through) & v.si.is_medium_transition()
-        medium = dr.select(crossed, v.si.target_medium(kept.d), medium)
+        medium = v.inside.medium(v.si, kept.d)
     elif not trace.traits.lights_vary:
         kept.known = KnownLight(v.glow, link.light.d, reached)
     else:
         w_light = to.f * (link.mis(to.pdf_light) * reciprocal(link.light.pdf))
         seen = arrive.sees_lights(trace, at, v.si, active)
         lighting = Lighting(v.si, seen, link.light, dr.select(link.lit, w_light, 0), link.lit)
-    signature, ray_next = _signature(v, at, kept.lobe, go_on), v.origin.spawn_ray(kept.d)
+    ray_next, signature = v.origin.spawn_ray(kept.d), v.signature(at, kept.lobe, go_on)
     return SampledStep(e, w, ray_next, kept.pdf, signature, kept, to.eta, to.null, to.active, medium, lighting)
 
 
@@ -97,11 +95,4 @@ def repeat_step(
     w, d, pdf = scatter.repeat(trace, v, again, ctx, attached)
     if v.inside is not None:
         e, w = v.inside.e + v.inside.w * e, v.inside.w * w
-    return Step(e, w, v.origin.spawn_ray(d), pdf, _signature(v, again.at, again.kept.lobe, again.go_on))
-
-
-def _signature(v: arrive.Vertex, at: Arrival, lobe: mi.UInt32, go_on: mi.Bool) -> Signature:
-    met, shape = v.si.is_valid(), dr.reinterpret_array(mi.UInt32, at.hit.shape)
-    if v.inside is not None:
-        met, shape = v.surface | (v.inside.event & go_on), dr.select(v.inside.event, 0, shape)
-    return Signature(met, shape, lobe)
+    return Step(e, w, v.origin.spawn_ray(d), pdf, v.signature(again.at, again.kept.lobe, again.go_on))

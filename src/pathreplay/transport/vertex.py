@@ -38,8 +38,6 @@ class TraceConfig:
     """Largest path depth, counted as in Mitsuba. Unbounded depth is 2^32 - 1."""
     rr_depth: int
     """Depth at which Russian roulette begins, counted as in Mitsuba's `prb`. `path` begins one vertex earlier."""
-    skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
-    """The method ``skip_area_emitters`` of Mitsuba's integrators."""
 
     # Inputs of gradient estimators.
     baseline: Callable[..., mi.Spectrum] | None = None

@@ -53,7 +53,7 @@ def differentiate_shadow(
             tracked &= t < b
             _differentiate(stretch.medium, stretch.ray, t, σ_bar, tracked, mi.Bool(False), weight)
         past.next_1d(inside)
-        stretch = stretch.beyond(hit, mi.Spectrum(1))[0]
+        stretch = stretch.beyond(trace, hit, mi.Spectrum(1))[0]
 
 
 def _differentiate(

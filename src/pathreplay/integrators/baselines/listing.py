@@ -20,7 +20,7 @@ from pathreplay.adjoint.primal import path_radiance
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.baselines.collisions import differentiate_flight, differentiate_shadow
 from pathreplay.transport import arrive, scatter
-from pathreplay.transport.connect import Connection, shadow_start
+from pathreplay.transport.connect import Connection
 from pathreplay.transport.emitters import redraw_emitter
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
@@ -71,7 +71,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
                 backward(dr.sum(δL * Lo))
 
         # The weights of the tentative collisions along the shadow ray multiply the radiance of the emitter sample.
-        ray, begins = v.origin.spawn_ray_to(light.p), shadow_start(v, light, path.at.medium)
+        ray, begins = v.origin.spawn_ray_to(light.p), v.inside.medium(v.si, light.d)
         differentiate_shadow(trace, ray, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
         path = onward
     return False

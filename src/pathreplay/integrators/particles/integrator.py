@@ -33,7 +33,7 @@ def _few_rays(view: Pass) -> Pass:
 
 
 class ParticleIntegrator(PathReplayIntegrator):
-    """Differentiable particle tracer for surfaces.
+    """Differentiable particle tracer for surfaces and media.
 
     Light paths start at the emitters and are connected to the sensor at every vertex. The number of light paths is the
     number of pixels times the samples per pixel. Emitters that the sensor sees directly are rendered with camera rays.
@@ -48,7 +48,7 @@ class ParticleIntegrator(PathReplayIntegrator):
     ``attach='none'``, it does not differentiate any motion. With a box filter, it does not differentiate the motion of
     film positions.
 
-    Raises PathreplayError for unknown or unusable properties, for scenes with media, and in polarised variants.
+    Raises PathreplayError for unknown or unusable properties, for media that emit, and in polarised variants.
     """
 
     name, properties = "pathreplay_particles", PARTICLES
@@ -79,5 +79,5 @@ class ParticleIntegrator(PathReplayIntegrator):
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
         """Return the configuration of the camera rays, which see emitters directly."""
         trace = PathIntegrator._trace_config(self, scene, sensor, state)
-        self.particles.require_no_media(trace)
+        self.particles.require_no_emission(trace)
         return replace(trace, max_depth=min(trace.max_depth, 1))

@@ -34,12 +34,12 @@ class ParticleTerm(Term):
     caustics: bool  # trace only the paths that `TraceConfig.without_caustics` omits, not all light paths
 
     @staticmethod
-    def require_no_media(trace: TraceConfig) -> None:
-        """Raise PathreplayError if the scene has media."""
-        if trace.media is not None:
+    def require_no_emission(trace: TraceConfig) -> None:
+        """Raise PathreplayError if the scene has media that emit light."""
+        if trace.media is not None and trace.media.emissive:
             raise PathreplayError(
-                "light paths do not pass through media yet: remove the media from the scene, or trace all paths from "
-                "the sensor"
+                "no light path can start in a medium that emits: set its radiance to 0, or trace all paths from the "
+                "sensor (integrator 'pathreplay')"
             )
 
     def image(self, view: Pass, trace: TraceConfig) -> mi.TensorXf | None:

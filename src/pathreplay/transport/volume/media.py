@@ -39,21 +39,28 @@ class Media:
     passes: bool  # some surface that is not a null boundary may transmit light unscattered
     branches: bool  # see `wants_branch`
     around: mi.Medium | None  # the medium that contains the sensor
+    outside: mi.Medium | None  # the medium around the whole scene: that of the sensor, unless a shape encloses it
 
 
 def scene_media(
-    media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | None, branches: bool | None = None
+    media: Sequence[mi.Medium],
+    passes: bool,
+    sensor: mi.Sensor | None,
+    branches: bool | None = None,
+    enclosed: Sequence[mi.Medium | None] = (),
 ) -> Media | None:
     """Collect the facts about the media of a scene, or return None without media.
 
     ``passes`` is stored in the field of the same name. The field ``around`` is the medium that contains ``sensor``.
-    ``branches`` is the result of `wants_branch`, or None if it must be computed.
+    ``branches`` is the result of `wants_branch`, or None if it must be computed. ``enclosed`` lists the media inside
+    shapes.
     """
     if not media:
         return None
     grids = tuple(medium for medium in media if _is_grid(medium))
     plain = [medium for medium in media if not _is_grid(medium)]
     below = set() if sensor is None else nodes_of(sensor)
+    around = next((node for node in below if isinstance(node, mi.Medium)), None)
     return Media(
         grids=grids,
         plain=bool(plain),
@@ -62,7 +69,8 @@ def scene_media(
         emissive=any(grid.emission is not None for grid in grids),
         passes=passes,
         branches=wants_branch(media) if branches is None else branches,
-        around=next((node for node in below if isinstance(node, mi.Medium)), None),
+        around=around,
+        outside=None if any(around is medium for medium in enclosed) else around,
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.facts.traits import is_null
 from pathreplay.transport.meet import meet
@@ -61,8 +62,32 @@ def transmittance_up_to(
     while dr.hint(stretch.active, exclude=[trace], label="pathreplay: passage"):
         hit, a, b, inside = stretch.part(trace)
         T = dr.select(inside, T * transmittance(trace, stretch.medium, stretch.ray, a, b, sampler, inside), T)
-        stretch, T = stretch.beyond(hit, T)
+        stretch, T = stretch.beyond(trace, hit, T)
     return T, stretch.medium
+
+
+@dr.syntax
+def medium_at_origin(
+    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> mi.MediumPtr:
+    """Return the medium that contains the origin of a ray; ``hit`` is the first hit of the ray. Detached.
+
+    It is the medium before the first surface on the ray that separates media. If there is no such surface, it is the
+    medium around the whole scene (`Media.outside`).
+    """
+    outside = trace.media.outside
+    medium = dr.zeros(mi.MediumPtr) if outside is None else mi.MediumPtr(outside)
+    here, onward = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray)
+    searching = active & here.is_valid()
+    while dr.hint(searching, exclude=[trace], label="pathreplay: medium around an emitter"):
+        si = here.compute_surface_interaction(onward, compat.shading(), searching)
+        turns = searching & si.is_medium_transition()
+        medium = dr.select(turns, si.target_medium(-onward.d), medium)
+        onward = si.spawn_ray(onward.d)
+        searching &= ~turns
+        here = meet(trace, onward, searching)
+        searching &= here.is_valid()
+    return medium
 
 
 def transmittance_past_edge(

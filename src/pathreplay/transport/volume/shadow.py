@@ -24,7 +24,7 @@ class Stretch:
     """Loop state of a shadow ray: the segment up to the next surface. The segment contains at most one medium."""
 
     ray: mi.Ray3f  # the rest of the shadow ray, behind the last surface that it met
-    far: mi.Float  # length of the whole shadow ray
+    end: mi.Point3f  # end of the shadow ray
     gone: mi.Float  # distance from the shadow ray's origin to the last surface
     medium: mi.MediumPtr
     active: mi.Bool
@@ -33,26 +33,39 @@ class Stretch:
     def begin(ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool) -> Stretch:
         """Return the first segment of a ray that starts in ``medium``. Detached."""
         ray = mi.Ray3f(dr.detach(ray))
-        return Stretch(ray, mi.Float(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
+        return Stretch(ray, ray(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
 
     def part(self, trace: TraceConfig) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
         """Return the surface at the segment's end, the part [a, b] inside a medium, and the mask of non-empty parts."""
-        self.ray.maxt = self.far - self.gone
         hit = meet(trace, self.ray, self.active)
         inside = self.active & (self.medium != None)  # noqa: E711 (an array of pointers)
         a, b = span(self.medium, self.ray, dr.select(self.active & hit.is_valid(), hit.t, self.ray.maxt), inside)
         return hit, a, b, inside & (a < b)
 
-    def beyond(self, hit: mi.PreliminaryIntersection3f, T: mi.Spectrum) -> tuple[Stretch, mi.Spectrum]:
-        """Return the segment behind the surface at ``hit``, and ``T`` times the null transmission of the surface."""
+    def beyond(
+        self, trace: TraceConfig, hit: mi.PreliminaryIntersection3f, T: mi.Spectrum
+    ) -> tuple[Stretch, mi.Spectrum]:
+        """Return the segment behind the surface at ``hit``, and ``T`` times the null transmission of the surface.
+
+        The segment leads to the end of the shadow ray. If it kept its direction, the offset of its origin along the
+        normal would shift it sideways, and it might meet the emitter at whose surface it should end. On the way from a
+        light path to the sensor, emitters hidden by ``hide_emitters`` occlude nothing.
+        """
         met, ray = self.active & hit.is_valid(), mi.Ray3f(self.ray)
         si = hit.compute_surface_interaction(ray, compat.shading(), met)
-        T = dr.select(met, T * si.bsdf(ray).eval_null_transmission(si, met), T)
+        transmission = si.bsdf(ray).eval_null_transmission(si, met)
+        if trace.hide_emitters and trace.to_sensor is not None:
+            transmission = dr.select(si.shape.emitter() != None, 1, transmission)  # noqa: E711 (an array of pointers)
+        T = dr.select(met, T * transmission, T)
         medium = dr.select(met & si.is_medium_transition(), si.target_medium(ray.d), self.medium)
-        onward = si.spawn_ray(ray.d)
-        gone = self.gone + dr.select(met, dr.norm(onward.o - ray.o), 0)
-        ray.o = dr.select(met, onward.o, ray.o)
-        return Stretch(ray, self.far, gone, medium, met & (gone < self.far) & dr.any(T != 0)), T
+        o = si.spawn_ray(ray.d).o
+        gone, rest = self.gone + dr.select(met, dr.norm(o - ray.o), 0), self.end - o
+        ends = dr.isfinite(dr.squared_norm(rest))
+        ahead = ~ends | (dr.dot(rest, ray.d) > 0)
+        turned = met & ends & ahead
+        ray.o, ray.d = dr.select(met, o, ray.o), dr.select(turned, dr.normalize(rest), ray.d)
+        ray.maxt = dr.select(turned, dr.norm(rest), ray.maxt)
+        return Stretch(ray, self.end, gone, medium, met & ahead & dr.any(T != 0)), T
 
 
 @dr.syntax
@@ -70,7 +83,7 @@ def shadow(trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: Sam
         picked = inside & (u < b - a)
         y = dr.select(picked, stretch.gone + a + u, y)
         y_medium = dr.select(picked, stretch.medium, y_medium)
-        stretch, T = stretch.beyond(hit, T)
+        stretch, T = stretch.beyond(trace, hit, T)
 
     return Shadow(T=T, y=y, medium=y_medium, length=length)
 
