@@ -12,6 +12,7 @@ import PIL.Image
 import pytest
 
 from driven import attached
+from pathreplay import PathreplayError
 from pathreplay.integrators.edge_notes import edges_note, moves_edges
 from pathreplay.inverse.images.io import over_black, read_image, transparent_share
 from pathreplay.jobs import make_config, optimize
@@ -97,6 +98,33 @@ def test_a_script_is_told_of_edges_that_are_too_close_to_points(far: float, log:
         dr.backward(dr.mean(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=1), axis=None))
     told = [line for line in log.lines if "left out, in a scene of size 2:" in line]
     assert len(told) == (far > 0)
+
+
+def test_a_script_is_told_of_the_samples_of_a_sunsky(log: Any) -> None:
+    scene = make_scene(sky={"type": "sunsky", "sun_direction": [0.4, 0.7, 0.5]})
+    for attach, times in (("none", 0), ("delta", 1)):
+        with attached(scene, "sky.sun_direction") as params:
+            integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2, "attach": attach})
+            dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=1), axis=None))
+        assert len([line for line in log.lines if "a sunsky has gradients" in line]) == times
+
+
+@pytest.mark.parametrize("kind", ["ellipsoids", "linearcurve"])
+def test_shapes_without_derivatives_are_told_and_refused(kind: str, tmp_path: Path, log: Any) -> None:
+    """Their parameters have flags of Mitsuba, or gradients that are wrong."""
+    points = tmp_path / "curve.txt"
+    points.write_text("-1 0 0 .2\n0 .5 0 .2\n1 0 0 .2\n")
+    rows = mi.TensorXf(np.array([[0, 0, 0, 0.4, 0.3, 0.3, 0, 0, 0, 1]], np.float32))
+    shape = {"type": kind, "data": rows} if kind == "ellipsoids" else {"type": kind, "filename": str(points)}
+    scene, key = make_scene(it=shape), "it.data" if kind == "ellipsoids" else "it.control_points"
+    for moved, told in (("cube.vertex_positions", 0), (key, 1)):
+        with attached(scene, moved) as params:
+            integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+            dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=1), axis=None))
+        assert len([line for line in log.lines if "edges of shape 'it' of class" in line]) == told
+    with attached(scene, key) as params, pytest.raises(PathreplayError, match="do not follow its parameters"):
+        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2, "boundary": "all"})
+        dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=1), axis=None))
 
 
 def test_a_script_is_told_of_the_tables_of_roughplastic(log: Any) -> None:

@@ -205,3 +205,63 @@ def test_hits_stay_short_of_the_end_of_a_spline(tmp_path: Path) -> None:
     assert 1000 < met.sum() < 4096
     v = (np.array(hit.prim_uv.x) + np.array(hit.prim_index).astype(np.float32)) / np.float32(2)
     assert np.floor(v[met] * np.float32(2)).max() == 1
+
+
+# ------------------------------ Meters ------------------------------
+
+
+ONE = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+
+
+def lamp_above(**parts: Any) -> dict:
+    place = T().translate([0.5, 2.5, 1]).rotate([1, 0, 0], 90).scale(0.7)
+    return {"type": "scene", "lamp": {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}, **parts}
+
+
+UP = (0, 0.9, 0.4)
+
+
+def slope(made: dict, key: str, plugin: str, seed: int, spp: int, step: float = 0.1) -> float:
+    """Derivative of the image of one pixel as a shape moves `UP`: by `pathreplay`, or by a difference of another."""
+    scene = mi.load_dict(made)
+    params, integrator = mi.traverse(scene), mi.load_dict({"type": plugin, "max_depth": 2})
+    first = type(params[key])(params[key])
+
+    def image(t: mi.Float) -> mi.Float:
+        up = mi.Vector3f(*UP) * t
+        if key.endswith("to_world"):
+            params[key] = mi.Transform4f().translate(up) @ first
+        else:
+            params[key] = dr.ravel(dr.unravel(mi.Point3f, first) + up)
+        params.update()
+        return mi.render(scene, params, integrator=integrator, spp=spp, seed=seed).array
+
+    if plugin != "pathreplay":
+        return float((image(mi.Float(step)) - image(mi.Float(-step)))[0]) / (2 * step)
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    dr.backward(image(t))
+    found = float(dr.grad(t)[0])
+    image(mi.Float(0))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["rectangle", pytest.param("disk", marks=pytest.mark.slow)])
+def test_a_meter_that_moves_sees_the_edges_of_a_lamp(kind: str) -> None:
+    """Only the edges of the lamp change the irradiance; `prb` has the gradient 0."""
+    place = T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(0.6)
+    made = lamp_above(plate={"type": kind, "to_world": place, "meter": {"type": "irradiancemeter", "film": ONE}})
+    ours = [slope(made, "plate.to_world", "pathreplay", seed, 2**16) for seed in range(8)]
+    differences = [slope(made, "plate.to_world", "path", 100 + seed, 2**18) for seed in range(8)]
+    apart = gap(np.array(ours), np.array(differences))
+    assert abs(apart.z) < Z_LIMIT and apart.error < 0.15 * np.mean(differences), apart
+
+
+def test_a_single_ray_sees_no_outlines() -> None:
+    look = T().look_at([0.3, 0.1, 4], [0.3, 0.05, 0], [0, 1, 0])
+    cube = {"type": "cube", "to_world": T().scale(0.6)}
+    made = lamp_above(cube=cube, eye={"type": "radiancemeter", "to_world": look, "film": ONE})
+    ours = [slope(made, "cube.vertex_positions", "pathreplay", seed, 2**12) for seed in range(4)]
+    differences = [slope(made, "cube.vertex_positions", "path", seed, 2**16, 0.02) for seed in range(4)]
+    apart = gap(np.array(ours), np.array(differences))
+    assert abs(apart.z) < Z_LIMIT and apart.error < 0.02 * abs(np.mean(differences)), apart

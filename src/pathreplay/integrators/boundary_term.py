@@ -22,6 +22,7 @@ from pathreplay.integrators.film.image import MOST_SAMPLES
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
+from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.motion import edges_move, moving_shapes
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
@@ -33,6 +34,8 @@ arcs, `NARROW_CLOSER` replaces `INNER_CLOSER`."""
 GRID = "SDFGrid"
 """Class of shapes whose silhouettes cannot be sampled. Rays miss them near the outline, and points on them cannot be
 kept at fixed surface coordinates."""
+DETACHED = {"Ellipsoids": "put 'ellipsoidsmesh' in its place", "LinearCurve": "put 'bsplinecurve' in its place"}
+"""Classes of shapes that Mitsuba 3.9 does not attach to their parameters, with the remedy."""
 BATCH = "BatchSensor"
 """Class of sensors whose rays cannot be differentiated with respect to film position: Dr.Jit terminates the process."""
 FILM_LENGTH = 0.5  # length of segments on the film, in pixels; shorter on a film of one pixel: see `FilmPlaces.detail`
@@ -91,6 +94,9 @@ class Boundary(Term):
         """
         if trace.media is not None or trace.traits.moving is not None:
             return trace
+        meter = view.sensor.get_shape()
+        if meter is not None and with_gradients(meter):
+            return trace  # rays start on a moving shape: all surfaces move relative to these rays
         moving, turning = moving_shapes(trace.scene, _still_cameras(view))
         return replace(trace, traits=replace(trace.traits, moving=moving, turning=turning))
 
@@ -107,6 +113,11 @@ class Boundary(Term):
                 return (
                     f"edges of shape '{shape.id()}' of type 'sdfgrid' cannot be differentiated: put a mesh in its place"
                 )
+            if (remedy := DETACHED.get(shape.class_name(), "")) and with_gradients(shape, "data", "control_points"):
+                return (
+                    f"edges of shape '{shape.id()}' of class {shape.class_name()} do not follow its parameters, and "
+                    f"neither do its points: {remedy}"
+                )
         return ""
 
     @staticmethod
@@ -121,7 +132,7 @@ class Boundary(Term):
         trace = self.informed(view, trace)
         n, seed = segments_of(view, places, self.spp), Stream.BOUNDARY.of(view.opaque_seed)
         on_film, length = max(n // FILM_CLOSER, 1), FILM_LENGTH * places.detail
-        if self.film:
+        if self.film and places.is_extended:
             yield PrimarySearch.of(trace, places, length).find(n, on_film, seed)
             if trace.media is not None and trace.traits.hard_lights:
                 yield VolumetricSearch.of(trace, places, length).find(n, on_film, seed)

@@ -20,6 +20,8 @@ from pathreplay.transport.start import CameraStart
 Seed: TypeAlias = "int | mi.UInt32"
 Which: TypeAlias = "int | mi.Sensor"
 """A sensor, or its index in the scene."""
+FLAT = frozenset({"Rectangle", "Disk"})
+"""Classes of shapes whose sampled normals Mitsuba 3.9 does not attach to ``to_world``."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,11 @@ class Pass:
         if self.flow is not None:
             return self.flow.ray(Sample(time, wavelength, position, aperture))
         # Irradiance meters do not implement `sample_ray`.
-        return self.sensor.sample_ray_differential(time, wavelength, position, aperture)
+        ray, weight = self.sensor.sample_ray_differential(time, wavelength, position, aperture)
+        shape = self.sensor.get_shape()
+        if shape is not None and shape.class_name() in FLAT:
+            ray.d = _turned(shape, ray.d)
+        return ray, weight
 
     def sobol_sampler(
         self, pixel: mi.UInt32, width: int, path: mi.UInt32, paths: int, of: int | mi.UInt32 = 0
@@ -171,3 +177,9 @@ class Pass:
             return ()
         seed = int(self.seed) if isinstance(self.seed, int) else int(self.seed[0])
         return ((seed, self.spp, self.sensor.ptr),)
+
+
+def _turned(shape: mi.Shape, d: mi.Vector3f) -> mi.Vector3f:
+    """Attach a direction, which is fixed in the frame of a flat shape's normal, to the ``to_world`` of the shape."""
+    n = dr.normalize(mi.traverse(shape)["to_world"] @ mi.Normal3f(0, 0, 1))
+    return dr.replace_grad(d, mi.Frame3f(n).to_world(mi.Frame3f(dr.detach(n)).to_local(dr.detach(d))))

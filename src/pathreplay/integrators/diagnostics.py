@@ -80,6 +80,11 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
             "the gradient of a roughplastic's alpha or eta is incomplete, and that of eta may have the wrong sign, "
             "because Mitsuba does not differentiate the tables that it computes from them; see docs/gradients.md"
         )
+    if traits.skies_move and trace.attach != "none":
+        yield (
+            "a sunsky has gradients, whose part of the sky is wrong, because its samples move with the sun; use attach "
+            "= 'none' for sun_direction of a sky without sun (sun_scale = 0), or an envmap; see docs/gradients.md"
+        )
     if trace.attach != "all":
         return
     if not traits.attachables:

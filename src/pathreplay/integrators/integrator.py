@@ -85,8 +85,8 @@ class PathReplayIntegrator(PathIntegrator):
 
     ``boundary = 'auto'`` means ``all`` if edges move (see `edges_move`) and the boundary term can be computed.
     Otherwise, ``auto`` means ``none``. The boundary term cannot be computed if ``attach`` is not ``delta``, if the
-    sensor is of type ``batch``, or if the scene contains an ``sdfgrid``. With ``auto``, a warning reports such a sensor
-    or shape. If no edge moves, no boundary term is computed for any value of ``boundary``.
+    sensor is of type ``batch``, or if the scene contains a shape that `Boundary.obstacle` names. With ``auto``, a
+    warning reports such a sensor or shape. If no edge moves, no boundary term is computed for any ``boundary``.
 
     Gradients of media use a control variate. The integrator learns the control variate from earlier gradient passes
     with other seeds. With ``null_branching``, an additional path continues from a null collision, as if the path had

@@ -15,6 +15,7 @@ from pathreplay.transport.facts.traits import (
     INSTANCE,
     MASK,
     PLASTIC,
+    SUNSKY,
     Tables,
     Traits,
     blend_lengths,
@@ -107,6 +108,7 @@ class SceneFacts:
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
             opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
             tables_move=any(with_gradients(plastic, "alpha", "eta") for plastic in self._plastics),
+            skies_move=any(with_gradients(light) for light in self._lights if light.class_name() == SUNSKY),
             lights_vary=any(map(with_gradients, self._emitters)),
         )
 

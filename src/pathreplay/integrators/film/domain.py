@@ -15,6 +15,8 @@ from pathreplay.samplers.streams import Stream
 
 PROJECTING = frozenset({"PerspectiveCamera", "ThinLensCamera"})
 """Classes of sensors that can project a point onto the film."""
+SINGLE_RAY = frozenset({"RadianceMeter"})
+"""Classes of sensors that have the same ray at all film positions. Their images show no edges."""
 BY_APERTURE = frozenset({"DistantSensorImpl"})
 """Classes of sensors whose rays depend on the aperture sample only. The film position takes its place here, so that
 rays differ between film positions."""
@@ -48,6 +50,11 @@ class FilmPlaces:
             aperture = position
         ray, weight = self.view.camera_ray(time, wavelength, position, aperture)
         return mi.Ray3f(ray), dr.detach(weight)
+
+    @property
+    def is_extended(self) -> bool:
+        """Whether different film positions have different rays."""
+        return self.view.sensor.class_name() not in SINGLE_RAY
 
     @property
     def is_coarse(self) -> bool:

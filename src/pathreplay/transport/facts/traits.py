@@ -28,7 +28,7 @@ RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
 # BSDFs that have no narrow lobe of their own. BSDFs nested in them may have one.
 DULL = FRAMES | {MASK, "SmoothDiffuse"}
-INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
+INSTANCE, PROJECTOR, SPOT, SUNSKY = "Instance", "Projector", "SpotLight", "SunskyEmitter"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Entries of `Tables.groups_at`: WHOLE for shapes whose only edges are outlines, FACETS for flat-shaded meshes."""
 COARSE = 1.0
@@ -89,6 +89,7 @@ class Traits:
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
     tables_move: bool = False  # the alpha or eta of a `roughplastic`, from which Mitsuba computes tables
+    skies_move: bool = False  # a parameter of a `sunsky`
     lights_vary: bool = False  # any parameter of an emitter, or of an emissive shape
     moving: tuple[mi.Shape, ...] | None = None  # shapes that may move; None: all shapes and the camera
     turning: tuple[mi.Shape, ...] = ()  # static shapes whose BSDF has gradients: rays that continue there may move
