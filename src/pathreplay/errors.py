@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Integral
+
 # Maximum length of a message, in characters. A longer message is shortened in the middle, because its two ends name the
 # object and the remedy.
 _LONGEST = 1000
@@ -23,6 +25,12 @@ def plain_line(text: str) -> str:
     line = " ".join(text.split())
     line = "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in line)
     return _cut(line, _LONGEST)
+
+
+def require_count(name: str, value: object, least: int) -> None:
+    """Raise PathreplayError unless ``value`` is an integer from ``least`` on."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise PathreplayError(f"{name} is {shown(value)}; give an integer of at least {least}")
 
 
 def shown(value: object, longest: int = 80) -> str:

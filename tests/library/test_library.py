@@ -606,6 +606,14 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(views=View(0, np.full((16, 16, 3), np.nan))), "NaN"),
         (bad(views=View(0, np.zeros((16, 16, 3), np.uint8))), r"array of uint8, .* give mi.Bitmap\(array\)"),
         (bad(views=View(0, PIL.Image.new("RGB", (16, 16)))), "array of uint8"),
+        (bad(views=View(0, np.zeros((16, 16, 3), np.int64))), "array of int64, whose encoding is unknown"),
+        (bad(views=View(0, np.zeros((16, 16, 3), bool))), "array of bool, whose encoding is unknown"),
+        (bad(views=View(0, np.zeros((16, 16, 3), complex))), "array of complex128, whose encoding is unknown"),
+        (bad(integrator="path"), "computes no gradients"),
+        (lambda photos: Problem.joint(Problem(room(), {WALL: GREY}, views(photos))), "problems: give a list"),
+        (lambda photos: Problem(room(), {WALL: GREY}, views(photos)).render(spp=0), "spp is 0; give an integer of at"),
+        (lambda photos: Problem(room(), {WALL: GREY}, views(photos)).render(spp=1.5), "spp is 1.5; give an integer"),
+        (lambda photos: pathreplay.value_and_grad(Problem(room(), {WALL: GREY}, views(photos)))(seed=-1), "seed is -1"),
         (bad(views=View(0, np.zeros((16, 16, 3)), weight=np.zeros((16, 16)))), "is black"),
         (bad(views=View(0, np.zeros((16, 16, 3)), weight=np.ones((3, 4)))), r"\(3, 4, 1\); give \(16, 16\)"),
         (bad(target={"alpha": "mask"}), "'target' would be replaced by 'views'; use View\\(target"),
@@ -640,6 +648,18 @@ def test_what_cannot_work_is_told_in_one_line(make: Callable[..., Any], words: s
     with pytest.raises(PathreplayError, match=words) as told:
         make(photos)
     assert "\n" not in str(told.value)
+
+
+def test_a_view_answers_to_the_id_of_its_sensor(photos: list[np.ndarray]) -> None:
+    """Its own name is valid in the names of files."""
+    scene = room()
+    scene["Camera 1"] = scene.pop("left")
+    problem = Problem(scene, {WALL: GREY}, [View("Camera 1", photos[0]), View("right", photos[1])])
+    (name,) = (view.name for view in problem.built.views if view.name != "right")
+    assert " " not in name
+    np.testing.assert_array_equal(problem.render(view="Camera 1", spp=1), problem.render(view=name, spp=1))
+    with pytest.raises(PathreplayError, match=r"No view 'Camera 2'"):
+        problem.render(view="Camera 2")
 
 
 def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None:

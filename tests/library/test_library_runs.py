@@ -231,3 +231,10 @@ def test_ten_scenes_one_after_the_other_leave_nothing_behind() -> None:
     assert len(list(Path("runs").iterdir())) == 10
     assert (dr.thread_count(), signal.getsignal(signal.SIGINT)) == (threads, handlers)
     assert result.render(view="left", spp=4).shape == (SIDE, SIDE, 3)
+
+
+@pytest.mark.parametrize("other", ["sgd", "rmsprop"])
+def test_a_run_does_not_go_on_with_another_optimizer(other: str, photos: list[np.ndarray]) -> None:
+    run(problem_of(photos), output="run", steps=4)
+    with pytest.raises(PathreplayError, match=r"no state of this optimizer .* resume with the optimizer of the run"):
+        run(problem_of(photos), other, output="run", steps=6, resume=True)

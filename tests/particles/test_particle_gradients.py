@@ -285,7 +285,7 @@ MEDIA = (
 )
 SPLIT = (
     mean("milk", milky, "ball.interior_medium.sigma_t.value.value", add([1, 1, 1]), **IN_FOG),
-    mean("air", milky, "ball.exterior_medium.sigma_t.value.value", add([1, 1, 1]), **IN_FOG),
+    mean("air", milky, "mist.interior_medium.sigma_t.value.value", add([1, 1, 1]), **IN_FOG),
 )
 
 

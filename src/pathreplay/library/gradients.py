@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from numpy.typing import ArrayLike
 
+from pathreplay.errors import require_count
 from pathreplay.inverse.config.schema import ITERATION
 from pathreplay.inverse.objective.evaluate import Shard, total
 from pathreplay.inverse.objective.stages import evaluator_of
@@ -41,6 +42,9 @@ def value_and_grad(problem: Problem) -> ValueAndGrad:
         values: Mapping[str, ArrayLike] | None = None, seed: int = 0, spp: int | None = None
     ) -> tuple[float, dict[str, Array]]:
         at = problem.complete(values)
+        require_count("seed", seed, 0)
+        if spp is not None:
+            require_count("spp", spp, 1)
         samples = config.most_spp if spp is None else spp
         shards = [
             Shard((n,), samples, config.seeds(ITERATION, view.sensor, seed, 1)) for n, view in built.trained().items()

@@ -10,8 +10,9 @@ from pathlib import Path
 import mitsuba as mi
 
 from pathreplay.distributed.ray_executor import RayExecutor, WorkerPool
-from pathreplay.errors import PathreplayError, shown
+from pathreplay.errors import PathreplayError, require_count, shown
 from pathreplay.inverse.config.schema import Plugin
+from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.events import Event, Stepped
@@ -74,12 +75,23 @@ class Iteration:
 
 
 def rendered(problem: Problem, values: Arrays, view: int | str, spp: int | None) -> Image:
-    """Render a view, given by index or name, with these values. Raises PathreplayError if there is no such view."""
+    """Render a view with these values. The view is given by its index or name, or by the id of its sensor.
+
+    Raises PathreplayError if there is no such view, or ``spp`` is not a positive integer.
+    """
+    if spp is not None:
+        require_count("spp", spp, 1)
     for n, each in enumerate(problem.views):
-        if view in (n, n - len(problem.views), each.name):
+        if view in (n, n - len(problem.views), each.name, _sensor_id(problem, each)):
             with problem.computing():
                 return picture_of(problem, values, each, spp)
     raise PathreplayError(f"No view {shown(view)}; there are {', '.join(each.name for each in problem.views)}")
+
+
+def _sensor_id(problem: Problem, view: View) -> str:
+    """Return the id of a view's sensor, which is not the view's name if it contains unusual characters."""
+    home, there = problem.home(view)
+    return str(home.scene.sensors()[there.sensor].id())
 
 
 def run_of(problem: Problem, pool: WorkerPool | None = None) -> Run:

@@ -65,7 +65,8 @@ class Problem:
         views: sensors and their targets.
         loss: a name (see `pathreplay.losses`), or ``loss(image, target)`` on tensors of shape (height, width, channels)
             that returns such a tensor or one number.
-        integrator: an integrator or its dictionary. Default: `pathreplay` with the depth of the scene's integrator.
+        integrator: an integrator, its dictionary or its type. Default: `pathreplay` with the depth of the scene's
+            integrator.
         derived: scene parameters that are computed from ``parameters``, by key or glob.
         spp: samples per pixel of the image and of its derivative.
         learning_rate: learning rate of parameters that have none of their own.
@@ -84,7 +85,7 @@ class Problem:
         views: View | Sequence[View],
         *,
         loss: str | Callable[[mi.TensorXf, mi.TensorXf], mi.TensorXf] = "l2",
-        integrator: Mapping[str, object] | mi.Integrator | None = None,
+        integrator: Mapping[str, object] | mi.Integrator | str | None = None,
         derived: Mapping[str, Derived] | None = None,
         spp: int = 16,
         learning_rate: float = 0.02,
@@ -105,7 +106,7 @@ class Problem:
         parameters: Mapping[str, Parameter | None] | Sequence[str] | str | None = None,
         views: View | Sequence[View] | None = None,
         loss: str | Callable[[mi.TensorXf, mi.TensorXf], mi.TensorXf] | None = None,
-        integrator: Mapping[str, object] | mi.Integrator | None = None,
+        integrator: Mapping[str, object] | mi.Integrator | str | None = None,
         derived: Mapping[str, Derived] | None = None,
     ) -> None:
         """Replace parts of the job's tables by the given objects, and build the problem."""
@@ -115,6 +116,7 @@ class Problem:
             backend.set_variant(job.get("variant"))
         job["variant"] = mi.variant()  # for runs that are resumed or exported by the command line
         wanted = None if parameters is None else by_key(parameters)
+        integrator = {"type": integrator} if isinstance(integrator, str) else integrator
         looked_at = None if views is None else [views] if isinstance(views, View) else list(views)
         require_kinds(wanted or {}, looked_at or (), derived or {})
         if wanted is not None:
@@ -161,8 +163,8 @@ class Problem:
             PathreplayError: shared parameters have different shapes, two problems have the same scene, or a problem has
                 exposures or a baseline.
         """
-        if not problems:
-            raise PathreplayError("problems: there are none; give two or more")
+        if not problems or isinstance(problems, Problem):
+            raise PathreplayError("problems: give a list of problems")
         joint: Problem = Problem.__new__(Problem)
         first = problems[0]
         joint.base, joint.in_memory = first.base, True
@@ -386,7 +388,7 @@ def load_job(
     parameters: Mapping[str, Parameter | None] | Sequence[str] | str | None = None,
     views: View | Sequence[View] | None = None,
     loss: str | Callable[[mi.TensorXf, mi.TensorXf], mi.TensorXf] | None = None,
-    integrator: Mapping[str, object] | mi.Integrator | None = None,
+    integrator: Mapping[str, object] | mi.Integrator | str | None = None,
     derived: Mapping[str, Derived] | None = None,
     define: Sequence[str] = (),
     **settings: object,

@@ -68,13 +68,14 @@ def _pixels(what: str, value: object, *, stored: bool = False) -> Image:
         raise PathreplayError(f"{what} is missing; give an array, a mi.Bitmap or a file")
     try:
         plain = np.asarray(value)
-        image = np.array(plain, np.float32)
+        coded = not stored and plain.dtype.kind in "biuc"
+        image = np.array(plain.real if coded else plain, np.float32)
     except (TypeError, ValueError) as error:
         raise PathreplayError(f"{what} is not an image ({error}); give an array, a mi.Bitmap or a file") from None
-    if not stored and plain.dtype in (np.uint8, np.uint16):
+    if coded:
         raise PathreplayError(
-            f"{what} is an array of {plain.dtype}, whose encoding is unknown; give mi.Bitmap(array), which is decoded "
-            "from sRGB, or an array of linear floats"
+            f"{what} is an array of {plain.dtype}, whose encoding is unknown; give mi.Bitmap(array) of 8- or 16-bit "
+            "integers, which is decoded from sRGB, or an array of linear floats"
         )
     image = image[:, :, None] if image.ndim == 2 else image
     if image.ndim != 3:

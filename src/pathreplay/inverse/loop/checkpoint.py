@@ -137,7 +137,13 @@ def restore(path: Path, run: Run, variables: Sequence[Variable], held: Collectio
     try:
         levels = {v.key: v.levels for v in variables}
         values, state, history, learned = _read(path, run.values, levels, held)
-        run.optimiser.restore(state, latents(variables, values))
+        try:
+            run.optimiser.restore(state, latents(variables, values))
+        except (KeyError, ValueError) as error:
+            raise PathreplayError(
+                f"Checkpoint {path} has no state of this optimizer ({error}); resume with the optimizer of the run, or "
+                "start a new run"
+            ) from None
         run.values, run.history, run.learned = values, history, learned
         return
     except ValidationError as error:
