@@ -662,6 +662,13 @@ def test_a_view_answers_to_the_id_of_its_sensor(photos: list[np.ndarray]) -> Non
         problem.render(view="Camera 2")
 
 
+def test_a_method_without_gradients_needs_none(photos: list[np.ndarray]) -> None:
+    """SciPy would warn in every iteration, which is an error in these tests."""
+    method = partial(scipy.optimize.minimize, method="Nelder-Mead")
+    problem = Problem(room(), {WALL: GREY}, views(photos), spp=1)
+    assert len(pathreplay.minimize(problem, method, 3, progress=False).history) == 3
+
+
 def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None:
     problem = Problem(room(), {WALL: GREY}, views(photos))
     held = mi.ad.Adam(lr=0.1)

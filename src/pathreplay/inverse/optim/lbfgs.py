@@ -107,6 +107,7 @@ class LineSearch:
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("error", ".* cannot handle .*bounds", RuntimeWarning)
+                warnings.filterwarnings("ignore", ".* does not use gradient information", RuntimeWarning)
                 bounds = None if free else scipy.optimize.Bounds(low, high)
                 result = self._search(recorded, self._start, jac=True, bounds=bounds)
         except RuntimeWarning as error:
