@@ -20,7 +20,7 @@ from pathreplay.transport.emitters import draw_emitter
 from pathreplay.transport.meet import meet
 from pathreplay.transport.sensor import SensorLink
 from pathreplay.transport.signature import edge_normal, outline_gap
-from pathreplay.transport.start import behind_emitters
+from pathreplay.transport.start import occluder
 from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexSamples, is_smooth
 from pathreplay.transport.volume.passage import skip_null, transmittance_past_edge
 
@@ -86,11 +86,7 @@ def _test_of_sensor(
         active = active & (x.shape.emitter() == None)  # noqa: E711 (an array of pointers)
     to = link.sight(x, u, active)
     lit, ray = active & to.valid, x.spawn_ray_to(to.end)
-    hit = meet(trace, ray, lit)
-    if trace.hide_emitters and trace.traits.area_lights:
-        hit = behind_emitters(trace, ray, hit, lit)
-        hit.t = dr.select(hit.t < ray.maxt, hit.t, dr.inf)
-    return ShadowTest(u, lit, mi.Spectrum(to.W), ray, hit, mi.Bool(False), to.s)
+    return ShadowTest(u, lit, mi.Spectrum(to.W), ray, occluder(trace, ray, lit), mi.Bool(False), to.s)
 
 
 @dataclass
@@ -125,8 +121,7 @@ class HardShadow:
         if link is not None and link.adjoint is not None:
             L *= link.adjoint(self.lit.uv, at.ray.wavelengths, active)
         if trace.media is not None:
-            turns = v.surface & v.si.is_medium_transition()
-            L *= self.blocked(trace, dr.select(turns, v.si.target_medium(self.lit.ray.d), at.medium), sampler, active)
+            L *= self.blocked(trace, v.medium(self.lit.ray.d), sampler, active)
         return dr.select(active, L, 0)
 
     def blocked(self, trace: TraceConfig, medium: mi.MediumPtr, sampler: Sampler, active: mi.Bool) -> mi.Spectrum:

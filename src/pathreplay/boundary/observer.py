@@ -254,8 +254,7 @@ class ObserverVertex:
         """Return the medium in direction ``d``; None in scenes without media."""
         if self.trace.media is None:
             return None  # `Arrival.medium` is also None in such scenes
-        turns = self.vertex.surface & self.si.is_medium_transition()
-        return dr.select(turns, self.si.target_medium(d), self.at.medium)
+        return self.vertex.medium(d)
 
     def arrival(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, pdf: mi.Float) -> Arrival:
         """Return the arrival at ``hit`` of a path that continues from the observer along ``ray``."""

@@ -40,6 +40,11 @@ class Vertex:
             met, shape = self.surface | (self.inside.event & go_on), dr.select(self.inside.event, 0, shape)
         return Signature(met, shape, lobe)
 
+    def medium(self, d: mi.Vector3f) -> mi.MediumPtr:
+        """Return the medium along a ray that leaves the vertex in direction ``d``, in a scene with media."""
+        turns = ~self.inside.event & self.si.is_valid() & self.si.is_medium_transition()
+        return dr.select(turns, self.si.target_medium(d), self.inside.around)
+
 
 @dataclass
 class InMedium:
@@ -53,11 +58,6 @@ class InMedium:
     flight: Flight
     w: mi.Spectrum  # weight of the radiance from the vertex: flight.W, multiplied by σ_s / density if ``event``
     e: mi.Spectrum  # radiance emitted by the medium along the flight
-
-    def medium(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.MediumPtr:
-        """Return the medium along a ray that leaves the vertex in direction ``d``. ``si`` is the vertex's surface."""
-        turns = ~self.event & si.is_valid() & si.is_medium_transition()
-        return dr.select(turns, si.target_medium(d), self.around)
 
 
 def choose(

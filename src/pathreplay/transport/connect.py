@@ -49,7 +49,7 @@ def choose(trace: TraceConfig, v: Vertex, u: VertexSamples, sampler: Sampler, go
     lit &= dr.select(event, v.inside.around.use_emitter_sampling(), is_smooth(v.bsdf))
     light, Le = draw_emitter(trace.scene, v.origin, u.light, lit, visible=False)
     lit &= light.pdf != 0
-    dark = shadow(trace, v.origin.spawn_ray_to(light.p), v.inside.medium(v.si, light.d), sampler, lit)
+    dark = shadow(trace, v.origin.spawn_ray_to(light.p), v.medium(light.d), sampler, lit)
     return Connection(light, Le * dark.T, lit & dr.any(dark.T != 0), dark)
 
 

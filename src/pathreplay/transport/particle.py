@@ -12,9 +12,8 @@ import mitsuba as mi
 
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport import arrive, scatter
-from pathreplay.transport.meet import meet
 from pathreplay.transport.sensor import SensorLink, Sighting
-from pathreplay.transport.start import behind_emitters
+from pathreplay.transport.start import occluder
 from pathreplay.transport.surface import normal_in_frame
 from pathreplay.transport.vertex import (
     Arrival,
@@ -56,13 +55,14 @@ def choose_step(
     c, w, kept, medium = sampled.f * to.W, sampled.w, sampled.kept, at.medium
     lit &= dr.any(c != 0)
     going, first = sampled.active & go_on, at.camera
+    ray = v.origin.spawn_ray_to(to.end)
     if v.inside is None:
-        lit &= _unoccluded(trace, v, to, lit)
+        lit &= ~(occluder(trace, ray, lit).is_valid() if trace.hide_emitters else trace.scene.ray_test(ray, lit))
     else:
-        dark = shadow(trace, v.origin.spawn_ray_to(to.end), v.inside.medium(v.si, to.d), sampler, lit)
+        dark = shadow(trace, ray, v.medium(to.d), sampler, lit)
         lit &= dr.any(dark.T != 0)
         kept.media = SampledInMedia(sampled.null, v.inside.flight, dark)
-        c, w, medium = v.inside.w * dark.T * c, v.inside.w * w, v.inside.medium(v.si, kept.d)
+        c, w, medium = v.inside.w * dark.T * c, v.inside.w * w, v.medium(kept.d)
         going, first = sampled.active & (go_on | sampled.null), first & ~sampled.null
     if link.caustics:
         going &= ~first | kept.delta
@@ -110,16 +110,6 @@ def _connects(trace: TraceConfig, v: arrive.Vertex) -> mi.Bool:
     # In a medium without emitter sampling, a collision counts as a delta lobe where caustics are set apart.
     event = v.inside.event & v.inside.around.use_emitter_sampling() if _link(trace).caustics else v.inside.event
     return connects | event
-
-
-def _unoccluded(trace: TraceConfig, v: arrive.Vertex, to: Sighting, active: mi.Bool) -> mi.Bool:
-    """Test whether the sensor sees a vertex. With ``hide_emitters``, area emitters occlude nothing."""
-    ray = v.origin.spawn_ray_to(to.end)
-    if not (trace.hide_emitters and trace.traits.area_lights):
-        return ~trace.scene.ray_test(ray, active)
-    # `behind_emitters` ignores the end of the ray. Surfaces beyond this end do not occlude the sensor.
-    hit = behind_emitters(trace, ray, meet(trace, ray, active), active)
-    return active & ~(hit.is_valid() & (hit.t < ray.maxt))
 
 
 def _weighted(link: SensorLink, splat: Splat, at: Arrival, lit: mi.Bool) -> mi.Spectrum:

@@ -80,6 +80,18 @@ def behind_emitters(
     return here
 
 
+def occluder(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
+    """Return the first hit on the way from a light path to the sensor. Hidden emitters occlude nothing.
+
+    ``ray`` ends at the sensor.
+    """
+    hit = meet(trace, ray, active)
+    if trace.hide_emitters and trace.traits.area_lights:
+        hit = behind_emitters(trace, ray, hit, active)
+        hit.valid = hit.is_valid() & (hit.t < ray.maxt)  # `behind_emitters` ignores the end of the ray
+    return hit
+
+
 def medium_around(trace: TraceConfig) -> mi.MediumPtr:
     """Return the medium that contains the camera."""
     around = trace.media.around

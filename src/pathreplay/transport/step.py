@@ -66,7 +66,7 @@ def choose_step(
     if v.inside is not None:
         kept.media = SampledInMedia(to.null, v.inside.flight, link.shadow)
         e, w = v.inside.e + v.inside.w * e, v.inside.w * w
-        medium = v.inside.medium(v.si, kept.d)
+        medium = v.medium(kept.d)
     elif not trace.traits.lights_vary:
         kept.known = KnownLight(v.glow, link.light.d, reached)
     else:

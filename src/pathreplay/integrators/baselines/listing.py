@@ -71,7 +71,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
                 backward(dr.sum(δL * Lo))
 
         # The weights of the tentative collisions along the shadow ray multiply the radiance of the emitter sample.
-        ray, begins = v.origin.spawn_ray_to(light.p), v.inside.medium(v.si, light.d)
+        ray, begins = v.origin.spawn_ray_to(light.p), v.medium(light.d)
         differentiate_shadow(trace, ray, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
         path = onward
     return False
