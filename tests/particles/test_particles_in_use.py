@@ -463,6 +463,23 @@ def test_recorded_steps_are_traced_steps(plugin: dict) -> None:
     np.testing.assert_allclose(steps(made, config, "recorded"), steps(made, config, "traced"), rtol=1e-4)
 
 
+FOG = """<shape type="cube" id="mist"><bsdf type="null"/>
+    <transform name="to_world"><scale value="0.9"/><translate y="1"/></transform>
+    <medium name="interior" type="homogeneous">
+      <rgb name="sigma_t" value="0.5"/><rgb name="albedo" value="0.7"/></medium></shape>
+</scene>"""
+
+
+@BOTH
+def test_recorded_steps_in_media_are_traced_steps(plugin: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "SCENE", SCENE.replace("</scene>", FOG))
+    key = "mist.interior_medium.sigma_t.value.value"
+    density = {"parameters": [{"key": key, "initial": 0.2}], "target": {"values": {key: 0.5}, "spp": 16}}
+    config = job(plugin, iterations=4, **density)
+    made = build_problem(config, Path.cwd())
+    np.testing.assert_allclose(steps(made, config, "recorded"), steps(made, config, "traced"), rtol=1e-3)
+
+
 def test_recorded_steps_with_edges_are_traced_steps() -> None:
     """Edges that the camera sees, and edges that the light of the caustic meets."""
     lamp = {
