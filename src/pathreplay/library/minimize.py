@@ -59,8 +59,8 @@ class Result:
     def apply(self, scene: mi.Scene) -> None:
         """Set the parameters of a scene to the resulting values, which the problem's own scene already has.
 
-        Raises PathreplayError if this is not a `mi.Scene`, lacks a parameter, or stores it such that it cannot have the
-        values. Load 8-bit textures with ``format = 'variant'``.
+        Raises PathreplayError if this is not a `mi.Scene`, lacks a parameter, or stores a parameter in a type that
+        cannot hold its value. A texture that is stored with 8 bits is an example: load it with ``format = 'variant'``.
         """
         self.problem.assign(self.values, scene)
 

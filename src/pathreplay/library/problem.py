@@ -254,8 +254,8 @@ class Problem:
     def assign(self, values: Arrays, scene: mi.Scene) -> None:
         """Set the parameters of a scene to these values.
 
-        Raises PathreplayError if this is not a `mi.Scene`, lacks a parameter, or stores it such that it cannot have the
-        values.
+        Raises PathreplayError if this is not a `mi.Scene`, lacks a parameter, or stores a parameter in a type that
+        cannot hold its value.
         """
         if not isinstance(scene, mi.Scene):
             raise PathreplayError(f"{shown(scene)} is not a scene of the active variant, {mi.variant()}; load it first")

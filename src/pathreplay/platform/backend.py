@@ -26,8 +26,9 @@ def point_drjit() -> None:
     """Make Dr.Jit load a working libLLVM, without testing it. Raises nothing.
 
     If drjit is not imported yet, DRJIT_LIBLLVM_PATH is set to the libLLVM of the wheel karellen-llvm-core, or else to
-    the newest system library that is not known to fail. If the variable already names a loadable library, its value
-    is kept. If drjit is already imported and has loaded a library that is known to fail, that library is replaced.
+    the newest system library that is not known to fail. If the variable already names a library that can be loaded and
+    is not known to fail, its value is kept. If drjit is already imported and has loaded a library that is known to
+    fail, that library is replaced if possible (see `reload_llvm`).
     """
     if "drjit" in sys.modules:
         path = None if loaded_is_plausible() else _untried_choice()

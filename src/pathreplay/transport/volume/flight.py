@@ -192,14 +192,14 @@ def fly_again(
     and a collision keeps its relative position in this interval. The collision thus moves with the ray and with the
     surface, and never crosses an end of the interval. Such a crossing would add a boundary term.
 
-    Let a and t be the ends of the flight, y points on the flight, x the collision, and b any function of position and
-    direction (`TraceConfig.baseline`). The control variate
+    Let a and t be the ends of the flight, y a random point between them, x the collision, and b any function of
+    position and direction (`TraceConfig.baseline`). The control variate
 
         (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (without a collision, only the first term)
 
-    has mean zero, because both terms have the same expectation. For b = 1, the control variate is the score of the
-    sampling density, up to sign. Without the control variate, the variance is high where the radiance is large and the
-    derivative of the radiance with respect to the medium is small.
+    has mean zero, because both terms have the same expectation. The first term is averaged over `POINTS` points y. For
+    b = 1, the control variate is the score of the sampling density, up to sign. Without the control variate, the
+    variance is high where the radiance is large and the derivative of the radiance with respect to the medium is small.
     """
     medium, ray = at.medium, at.ray
     in_medium = active & (medium != None)  # noqa: E711

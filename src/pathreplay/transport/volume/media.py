@@ -51,9 +51,9 @@ def scene_media(
 ) -> Media | None:
     """Collect the facts about the media of a scene, or return None without media.
 
-    ``passes`` is stored in the field of the same name. The field ``around`` is the medium that contains ``sensor``.
-    ``branches`` is the result of `wants_branch`, or None if it must be computed. ``enclosed`` lists the media inside
-    shapes.
+    ``passes`` tells whether some surface that is not a null boundary may transmit light unscattered. ``branches`` is
+    the result of `wants_branch`, or None if it must be computed. ``enclosed`` lists the media inside shapes: if the
+    medium of ``sensor`` is one of them, it does not surround the whole scene.
     """
     if not media:
         return None
