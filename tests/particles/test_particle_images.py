@@ -309,6 +309,7 @@ MISTS: dict[str, dict] = {
     "constant, grid": {"light": "constant", "kind": "grid"},
     "point, in a hall": {"light": "point", "around": "box"},
     "area, endless": {"light": "area", "around": "endless"},
+    "area, bubble": {"light": "area", "around": "bubble"},
 }
 QUICK_MISTS = ("spot, coloured", "point, in a hall")
 

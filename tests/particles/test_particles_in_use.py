@@ -131,6 +131,20 @@ def test_media_that_emit_are_refused_in_one_line() -> None:
     assert np.isfinite(np.array(mi.load_dict(CAUSTICS).render(made, spp=1))).all()  # camera paths find its light
 
 
+@pytest.mark.parametrize("light", ["directional", "constant"])
+def test_emitters_at_infinity_in_endless_fog_are_refused_in_one_line(light: str) -> None:
+    with pytest.raises(PathreplayError, match="it is at infinity, in a medium without bounds") as told:
+        mi.load_dict(PARTICLES).render(mi.load_dict(endless(light)), spp=1)
+    assert "\n" not in str(told.value)
+
+
+def endless(light: str) -> dict:
+    """Endless fog around everything."""
+    scene = misty(light, around="endless")
+    del scene["mist"]
+    return scene
+
+
 SPECTRA = """
 import sys
 from pathreplay.platform.backend import set_variant

@@ -282,7 +282,8 @@ def fog(kind: str = "grey") -> dict:
 def misty(light: str = "point", kind: str = "grey", around: str = "", **more: Any) -> dict:
     """A ball in a box of fog over a floor; all emitters are outside of the box.
 
-    ``around`` puts camera and emitter into a second fog: "endless", or in a large "box".
+    ``around`` puts camera and emitter into a second fog: "endless", or in a large "box". With "bubble", the fog is
+    endless, and the camera is in a bubble of denser fog.
     """
     T = mi.ScalarTransform4f
     scene = balls(light=light)
@@ -298,6 +299,11 @@ def misty(light: str = "point", kind: str = "grey", around: str = "", **more: An
         if around == "box":
             room = {"type": "cube", "to_world": T().translate([0, 3, 0]).scale(6), "bsdf": {"type": "null"}}
             scene["hall"] = {**room, "interior": thin}
+        if around == "bubble":
+            scene["dense"] = {"type": "homogeneous", "sigma_t": rgb(0.8, 0.6, 0.7), "albedo": rgb(0.5, 0.7, 0.9)}
+            scene["sensor"]["medium"] = dense = {"type": "ref", "id": "dense"}
+            bubble = {"type": "sphere", "center": [0, 2, -3.6], "radius": 0.5, "bsdf": {"type": "null"}}
+            scene["bubble"] = {**bubble, "interior": dense, "exterior": thin}
     return {**scene, **more}
 
 

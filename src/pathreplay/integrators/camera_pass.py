@@ -15,6 +15,7 @@ from pathreplay.platform.registration import mitsuba_integrator
 from pathreplay.samplers.owen_sobol import OwenSobolSampler, key_of, morton_index
 from pathreplay.samplers.pixel_samples import IndependentSets, PixelSamples, SobolSets
 from pathreplay.samplers.sampler import Sampler
+from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.start import CameraStart
 
 Seed: TypeAlias = "int | mi.UInt32"
@@ -130,7 +131,7 @@ class Pass:
         # Irradiance meters do not implement `sample_ray`.
         ray, weight = self.sensor.sample_ray_differential(time, wavelength, position, aperture)
         shape = self.sensor.get_shape()
-        if shape is not None and shape.class_name() in FLAT:
+        if shape is not None and shape.class_name() in FLAT and with_gradients(shape, "to_world"):
             ray.d = _turned(shape, ray.d)
         return ray, weight
 
@@ -180,6 +181,9 @@ class Pass:
 
 
 def _turned(shape: mi.Shape, d: mi.Vector3f) -> mi.Vector3f:
-    """Attach a direction, which is fixed in the frame of a flat shape's normal, to the ``to_world`` of the shape."""
+    """Attach a direction, which is fixed in the frame of a flat shape's normal, to the ``to_world`` of the shape.
+
+    The direction of a ray from an irradiance meter does not depend on the film position.
+    """
     n = dr.normalize(mi.traverse(shape)["to_world"] @ mi.Normal3f(0, 0, 1))
     return dr.replace_grad(d, mi.Frame3f(n).to_world(mi.Frame3f(dr.detach(n)).to_local(dr.detach(d))))

@@ -55,7 +55,7 @@ class SceneFacts:
         self._textures = [node for node in nodes if isinstance(node, mi.Texture)]
         self._seams: bool | None = None
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
-        self._enclosed = [shape.interior_medium() for shape in self._shapes]
+        self._bounded = any(shape.is_medium_transition() for shape in self._shapes)
         self._bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
         self._with_constants = [
             node for node in nodes if isinstance(node, _kinds_with_constants()) and plain_numbers(node)
@@ -81,7 +81,7 @@ class SceneFacts:
 
     def media(self, sensor: mi.Sensor | None, branches: bool | None = None) -> Media | None:
         """Return the current media of the scene. ``sensor`` may be inside a medium."""
-        return scene_media(self._media, self._traits.veils, sensor, branches, self._enclosed)
+        return scene_media(self._media, self._traits.veils, sensor, branches, self._bounded)
 
     def constants(self) -> tuple[object, ...]:
         """Return the current values that kernels treat as constants.

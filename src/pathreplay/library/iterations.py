@@ -81,10 +81,14 @@ def rendered(problem: Problem, values: Arrays, view: int | str, spp: int | None)
     """
     if spp is not None:
         require_count("spp", spp, 1)
-    for n, each in enumerate(problem.views):
-        if view in (n, n - len(problem.views), each.name, _sensor_id(problem, each)):
-            with problem.computing():
-                return picture_of(problem, values, each, spp)
+    places = {name: n for n, each in enumerate(problem.views) for name in (n, n - len(problem.views), each.name)}
+    ids = [_sensor_id(problem, each) for each in problem.views]
+    place = places.get(view)
+    if place is None and isinstance(view, str) and ids.count(view) == 1:
+        place = ids.index(view)
+    if place is not None:
+        with problem.computing():
+            return picture_of(problem, values, problem.views[place], spp)
     raise PathreplayError(f"No view {shown(view)}; there are {', '.join(each.name for each in problem.views)}")
 
 

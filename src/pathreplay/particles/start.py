@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,8 +13,9 @@ from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.emitters import area_growth
 from pathreplay.transport.facts.nodes import is_mesh
 from pathreplay.transport.meet import meet
+from pathreplay.transport.start import medium_around
 from pathreplay.transport.vertex import Arrival, TraceConfig, reciprocal
-from pathreplay.transport.volume.passage import medium_at_origin
+from pathreplay.transport.volume.passage import medium_at_end, medium_at_origin
 
 #: Classes of emitters that can emit rays.
 EMITTERS = frozenset(
@@ -37,6 +38,10 @@ SUN = "DirectionalEmitter"
 # by which Mitsuba offsets origins along the normal. Only rays nearly parallel to the triangle have a larger distance.
 # These rays carry almost no flux, and are rejected.
 CLOSE = 100
+
+# Direction of the ray on which the medium around the scene is found. It is parallel to no axis, because axes are often
+# parallel to surfaces.
+AWAY = 0.31, 0.83, 0.47
 
 
 @dataclass
@@ -64,6 +69,7 @@ class Emission:
     suns: tuple[mi.Emitter, ...]  # directional emitters
     rounded: tuple[mi.Emitter, ...]  # emissive meshes with interpolated normals
     spheres: tuple[mi.Emitter, ...]  # emissive spheres whose origins Mitsuba samples uniformly
+    outside: mi.MediumPtr = None  # type: ignore[assignment]  # the medium around the scene; None in scenes without media
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor, caustics: bool) -> Emission | None:
@@ -82,6 +88,27 @@ class Emission:
         maps, suns = (tuple(each for each in emitters if each.class_name() == kind) for kind in (MAP, SUN))
         rounded, spheres = (tuple(filter(test, emitters)) for test in (_has_smooth_mesh, _is_uniform_sphere))
         return Emission(scene, sensor, tuple(weights), maps, suns, rounded, spheres)
+
+    def surrounded(self, trace: TraceConfig) -> Emission:
+        """Return the emission with the medium around the scene, found on a ray that leaves the scene from the sensor.
+
+        Raises PathreplayError if an emitter at infinity would emit into fog without bounds.
+        """
+        if trace.media is None:
+            return self
+        for each, weight in zip(self.scene.emitters(), self.weights, strict=True):
+            infinite = mi.has_flag(each.flags(), mi.EmitterFlags.Infinite)
+            if weight > 0 and infinite and trace.media.around is not None and not trace.media.bounded:
+                raise PathreplayError(
+                    f"no light path can start at emitter '{each.id()}': it is at infinity, in a medium without bounds, "
+                    "which absorbs all of its light; put the medium into a shape with a 'null' BSDF"
+                )
+        shape = self.sensor.get_shape()
+        origin = self.sensor.world_transform() @ mi.Point3f(0) if shape is None else mi.Point3f(shape.bbox().center())
+        away = mi.Ray3f(dr.detach(origin), dr.normalize(mi.Vector3f(*AWAY)))
+        outside = medium_at_end(trace, away, medium_around(trace))
+        dr.eval(outside)
+        return replace(self, outside=outside)
 
     def pick(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Select an emitter; return its index, a random number independent of the index, and its probability."""
@@ -259,7 +286,8 @@ class EmitterStart:
         hit = meet(trace, ray, active)
         at = Arrival(ray=mi.Ray3f(ray), hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
         if trace.media is not None:
-            at.medium, at.behind = medium_at_origin(trace, ray, hit, active), mi.Float(0)
+            at.medium = medium_at_origin(trace, ray, hit, self.emission.outside, active)
+            at.behind = mi.Float(0)
         return at
 
     def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:

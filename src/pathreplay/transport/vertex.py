@@ -56,7 +56,8 @@ class TraceConfig:
     vertices are connected to emitters."""
     without_caustics: bool = False
     """Whether camera paths omit caustics, because light paths estimate them. Caustics are paths with a smooth lobe at
-    the first vertex and a delta lobe at the last vertex before the emitter, which is not an environment."""
+    the first vertex and a delta lobe at the last vertex before the emitter, which is not an environment. A collision
+    in a medium counts as a smooth lobe or, if the medium does not use emitter sampling, as a delta lobe."""
 
     # Choices of the caller.
     skips_null: bool = False

@@ -16,7 +16,8 @@ from pathreplay.samplers.streams import Stream
 PROJECTING = frozenset({"PerspectiveCamera", "ThinLensCamera"})
 """Classes of sensors that can project a point onto the film."""
 SINGLE_RAY = frozenset({"RadianceMeter"})
-"""Classes of sensors that have the same ray at all film positions. Their images show no edges."""
+"""Classes of sensors that have the same ray at all film positions. Their images show no edges, except in media: there,
+the boundary of a hard shadow moves along the ray. This motion is not differentiated."""
 BY_APERTURE = frozenset({"DistantSensorImpl"})
 """Classes of sensors whose rays depend on the aperture sample only. The film position takes its place here, so that
 rays differ between film positions."""

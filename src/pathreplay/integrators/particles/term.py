@@ -74,4 +74,5 @@ class ParticleTerm(Term):
         film = ParticleFilm.of(view.sensor)
         key = key_of(view.opaque_seed, mi.UInt32(int(Stream.PARTICLES)))
         trace = link_of(replace(trace, max_depth=self.max_depth), view.sensor, self.caustics)
+        emission = emission.surrounded(trace)
         return trace, Particles(emission, key, film.pixels * view.spp), film

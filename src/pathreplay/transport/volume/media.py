@@ -39,7 +39,7 @@ class Media:
     passes: bool  # some surface that is not a null boundary may transmit light unscattered
     branches: bool  # see `wants_branch`
     around: mi.Medium | None  # the medium that contains the sensor
-    outside: mi.Medium | None  # the medium around the whole scene: that of the sensor, unless a shape encloses it
+    bounded: bool  # some shape separates media; otherwise the medium of the sensor fills the whole space
 
 
 def scene_media(
@@ -47,20 +47,18 @@ def scene_media(
     passes: bool,
     sensor: mi.Sensor | None,
     branches: bool | None = None,
-    enclosed: Sequence[mi.Medium | None] = (),
+    bounded: bool = True,
 ) -> Media | None:
     """Collect the facts about the media of a scene, or return None without media.
 
     ``passes`` tells whether some surface that is not a null boundary may transmit light unscattered. ``branches`` is
-    the result of `wants_branch`, or None if it must be computed. ``enclosed`` lists the media inside shapes: if the
-    medium of ``sensor`` is one of them, it does not surround the whole scene.
+    the result of `wants_branch`, or None if it must be computed. ``bounded`` is stored in `Media`.
     """
     if not media:
         return None
     grids = tuple(medium for medium in media if _is_grid(medium))
     plain = [medium for medium in media if not _is_grid(medium)]
     below = set() if sensor is None else nodes_of(sensor)
-    around = next((node for node in below if isinstance(node, mi.Medium)), None)
     return Media(
         grids=grids,
         plain=bool(plain),
@@ -69,8 +67,8 @@ def scene_media(
         emissive=any(grid.emission is not None for grid in grids),
         passes=passes,
         branches=wants_branch(media) if branches is None else branches,
-        around=around,
-        outside=None if any(around is medium for medium in enclosed) else around,
+        around=next((node for node in below if isinstance(node, mi.Medium)), None),
+        bounded=bounded,
     )
 
 

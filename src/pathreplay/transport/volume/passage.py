@@ -68,25 +68,41 @@ def transmittance_up_to(
 
 @dr.syntax
 def medium_at_origin(
-    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, outside: mi.MediumPtr, active: mi.Bool
 ) -> mi.MediumPtr:
     """Return the medium that contains the origin of a ray; ``hit`` is the first hit of the ray. Detached.
 
-    It is the medium before the first surface on the ray that separates media. If there is no such surface, it is the
-    medium around the whole scene (`Media.outside`).
+    It is the medium before the first surface on the ray that separates media. If there is no such surface, it is
+    ``outside``, the medium around the whole scene (see `medium_at_end`).
     """
-    outside = trace.media.outside
-    medium = dr.zeros(mi.MediumPtr) if outside is None else mi.MediumPtr(outside)
-    here, onward = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray)
-    searching = active & here.is_valid()
-    while dr.hint(searching, exclude=[trace], label="pathreplay: medium around an emitter"):
-        si = here.compute_surface_interaction(onward, compat.shading(), searching)
-        turns = searching & si.is_medium_transition()
-        medium = dr.select(turns, si.target_medium(-onward.d), medium)
-        onward = si.spawn_ray(onward.d)
-        searching &= ~turns
-        here = meet(trace, onward, searching)
-        searching &= here.is_valid()
+    medium = mi.MediumPtr(outside)
+    if dr.hint(trace.media.bounded, mode="scalar"):
+        here, onward = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray)
+        searching = active & here.is_valid()
+        while dr.hint(searching, exclude=[trace], label="pathreplay: medium around an emitter"):
+            si = here.compute_surface_interaction(onward, compat.minimal(), searching)
+            turns = searching & si.is_medium_transition()
+            medium = dr.select(turns, si.target_medium(-onward.d), medium)
+            onward = si.spawn_ray(onward.d)
+            searching &= ~turns
+            here = meet(trace, onward, searching)
+            searching &= here.is_valid()
+    return medium
+
+
+@dr.syntax
+def medium_at_end(trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr) -> mi.MediumPtr:
+    """Return the medium in which a ray ends that starts in ``medium`` and passes all surfaces. Detached."""
+    medium, onward = mi.MediumPtr(medium), mi.Ray3f(ray)
+    if dr.hint(trace.media.bounded, mode="scalar"):
+        here = meet(trace, onward, mi.Bool(True))
+        passing = here.is_valid()
+        while dr.hint(passing, exclude=[trace], label="pathreplay: medium around the scene"):
+            si = here.compute_surface_interaction(onward, compat.minimal(), passing)
+            medium = dr.select(si.is_medium_transition(), si.target_medium(onward.d), medium)
+            onward = si.spawn_ray(onward.d)
+            here = meet(trace, onward, passing)
+            passing &= here.is_valid()
     return medium
 
 
