@@ -163,8 +163,9 @@ class Problem:
             PathreplayError: shared parameters have different shapes, two problems have the same scene, or a problem has
                 exposures or a baseline.
         """
-        if not problems or isinstance(problems, Problem):
-            raise PathreplayError("problems: give a list of problems")
+        if isinstance(problems, Problem) or not problems:
+            found = "this is a single one" if problems else "there are none"
+            raise PathreplayError(f"problems: {found}; give a list of problems")
         joint: Problem = Problem.__new__(Problem)
         first = problems[0]
         joint.base, joint.in_memory = first.base, True
