@@ -610,7 +610,7 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(views=View(0, np.zeros((16, 16, 3), bool))), "array of bool, whose encoding is unknown"),
         (bad(views=View(0, np.zeros((16, 16, 3), complex))), "array of complex128, whose encoding is unknown"),
         (bad(integrator="path"), "computes no gradients"),
-        (lambda photos: Problem.joint(Problem(room(), {WALL: GREY}, views(photos))), "this is a single one; give a list"),
+        (lambda photos: Problem.joint(Problem(room(), {WALL: GREY}, views(photos))), "this is a single one"),
         (lambda photos: Problem(room(), {WALL: GREY}, views(photos)).render(spp=0), "spp is 0; give an integer of at"),
         (lambda photos: Problem(room(), {WALL: GREY}, views(photos)).render(spp=1.5), "spp is 1.5; give an integer"),
         (lambda photos: pathreplay.value_and_grad(Problem(room(), {WALL: GREY}, views(photos)))(seed=-1), "seed is -1"),
