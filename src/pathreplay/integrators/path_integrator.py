@@ -79,7 +79,7 @@ class PathIntegrator(Unlearned):
     uses_sobol = False  # whether Owen-scrambled Sobol samples replace independent samples
     boundary = "none"  # boundary terms that are estimated
     interior: Term
-    max_depth: int  # this member and the next two belong to Mitsuba's integrator
+    max_depth: int  # this member and the next belong to Mitsuba's integrator
     rr_depth: int
 
     def __init__(self, props: mi.Properties) -> None:
