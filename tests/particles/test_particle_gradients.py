@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from particle_scenes import ROUGH, dome, milky, mirror, misty, plane, rgb, sensor, slab
+from particle_scenes import ROUGH, dome, milky, mirror, misty, plane, rgb, round_mesh, sensor, slab
 from pathreplay.platform import compat
 from pathreplay.testing.objective import Move, Objective, smooth_weights
 from pathreplay.testing.statistics import gap
@@ -435,6 +435,30 @@ EDGES = (
 GRAZED = ball("outline of a glass ball", lens)
 
 
+def foggy(light: str = "point", kind: str = "grey", center: tuple[float, float, float] = (-0.3, 1.0, 0.1)) -> dict:
+    """`misty` with a small black ball as an occluder, in place of the rough one."""
+    scene = misty(light, kind)
+    scene["ball"] = round_mesh(80, 0.2, center, BLACK)
+    return scene
+
+
+BETWEEN = (0.0, 1.9, -0.9)
+"""A place between the box of fog and the camera."""
+in_fog: Callable[..., Mean] = partial(
+    mean, key="ball.vertex_positions", move=shift, depth=2, reference="volpath", peer="pathreplay", spp=2048,
+    step=2e-2, options={"boundary": "all"},
+)  # fmt: skip
+FOG_EDGES = (
+    in_fog("ball, point", foggy),
+    in_fog("ball, spot, coloured", partial(foggy, "spot", "coloured")),
+    in_fog("ball, area, grid", partial(foggy, "area", "grid")),
+    in_fog("ball, directional", partial(foggy, "directional")),
+    in_fog("ball before the camera", partial(foggy, center=BETWEEN)),
+    in_fog("light moves", foggy, key="light.position", move=add([0.3, 0.5, 0.7])),
+    in_fog("camera moves", foggy, key="sensor.to_world", move=translate(0.3, 0.5, 0.7)),
+)
+
+
 def test_a_shadow_in_the_light_is_in_the_gradient() -> None:
     (cell,) = (c for c in EDGES if c.name == "floor moves")
     z, error = in_expectation(replace(cell, seeds=4, spp=512))
@@ -444,6 +468,12 @@ def test_a_shadow_in_the_light_is_in_the_gradient() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("cell", EDGES, ids=lambda c: c.name)
 def test_edges_that_light_meets_are_in_the_gradient(cell: Mean) -> None:
+    hold_both_modes(cell, cell.spp // 16)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", FOG_EDGES, ids=lambda c: c.name)
+def test_edges_in_fog_are_in_the_gradient(cell: Mean) -> None:
     hold_both_modes(cell, cell.spp // 16)
 
 

@@ -1,13 +1,13 @@
 """Differentiates a single step of a path in reverse or forward mode.
 
-No other module calls automatic differentiation.
+No other module differentiates the step of a path.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -110,56 +110,27 @@ def backward_step(
 
 
 def forward_step(
-    trace: TraceConfig, v: VertexRecord, attached: bool, tangent: RayDerivative, active: mi.Bool
-) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative]:
-    """Evaluate the step at vertex i again; return it, and the tangents of e_i, w_i (see `Step`) and the next ray."""
-    with dr.resume_grad():
-        at = _with_tangent(v.at, tangent) if attached else v.at
-        step = repeat_step(trace, replace(v, at=at), attached, active)
-        δe, δw, δo, δd, δpdf = tangents(step.e, step.w, step.ray_next.o, step.ray_next.d, step.pdf)
-    return step, δe, δw, RayDerivative(δo, δd, δpdf)
-
-
-class Footprint(Protocol):
-    """Weights with which the pixels around a film position receive a contribution, along both axes of the film."""
-
-    x: list[mi.Float]
-    y: list[mi.Float]
-
-
-F = TypeVar("F", bound=Footprint)
-
-
-@dataclass
-class SplatTangent(Generic[F]):
-    """The contribution of a vertex to the film, and its tangent."""
-
-    c: mi.Spectrum
-    at: F
-    δc: mi.Spectrum
-    δx: list[mi.Float]  # tangents of ``at.x``
-    δy: list[mi.Float]
-
-
-def forward_splat(
     trace: TraceConfig,
     v: VertexRecord,
     attached: bool,
     tangent: RayDerivative,
-    footprint: Callable[[mi.Point2f], F],
     active: mi.Bool,
-) -> tuple[Step, SplatTangent[F], mi.Spectrum, RayDerivative]:
-    """Evaluate a step of a light path again. Return the step, its splat, and the tangents of weight and next ray."""
+    more: Callable[[Step], Sequence[Any]] = lambda step: (),
+) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative, list[Any]]:
+    """Evaluate the step at vertex i again, with the tangent of the arriving ray.
+
+    Returns the step, detached, the tangents of e_i, w_i (see `Step`) and the next ray, and the tangents of the values
+    that ``more`` computes from the step.
+    """
     with dr.resume_grad():
         at = _with_tangent(v.at, tangent) if attached else v.at
         step = repeat_step(trace, replace(v, at=at), attached, active)
-        assert step.splat is not None
-        on_film = footprint(step.splat.s)
-        n = len(on_film.x)
-        ray = step.ray_next
-        δc, δw, δo, δd, δpdf, *δh = tangents(step.splat.c, step.w, ray.o, ray.d, step.pdf, *on_film.x, *on_film.y)
-    splat = SplatTangent(dr.detach(step.splat.c), dr.detach(on_film), δc, δh[:n], δh[n:])
-    return step, splat, δw, RayDerivative(δo, δd, δpdf)
+        values = step.e, step.w, step.ray_next.o, step.ray_next.d, step.pdf, *more(step)
+        # Without this, attached parts of the step that no value uses stay in the graph. Dr.Jit 1.5 then refuses to
+        # differentiate virtual calls in a loop.
+        step = dr.detach(step)
+        δe, δw, δo, δd, δpdf, *δmore = tangents(*values)
+    return step, δe, δw, RayDerivative(δo, δd, δpdf), δmore
 
 
 def backward_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> RayDerivative:

@@ -42,13 +42,13 @@ def forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> t
         if dr.hint(trace.branch, mode="scalar"):
             branch = branch.offer(path, step)
         onward, v = path.advance(trace, u, step)
-        again, δe, δw, δ = forward_step(trace, v, moves, δ, path.active)
+        again, δe, δw, δ, _ = forward_step(trace, v, moves, δ, path.active)
         if dr.hint(moves, mode="scalar"):
             δ, finite = δ.finite_part()
             lost.add(path.active & ~finite & ~broken)
             broken |= ~finite
-        δL += δβ * dr.detach(again.e) + path.β * δe
-        δβ = (δβ * dr.detach(again.w) + path.β * δw) * v.rr_weight
+        δL += δβ * again.e + path.β * δe
+        δβ = (δβ * again.w + path.β * δw) * v.rr_weight
         path = onward
 
     if dr.hint(trace.branch, mode="scalar"):

@@ -22,7 +22,7 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import may_move, may_turn
 from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import mixed, place_met, shape_met, turned_away
-from pathreplay.transport.start import CameraStart, medium_around
+from pathreplay.transport.start import CameraStart
 from pathreplay.transport.surface import steady
 from pathreplay.transport.vertex import Arrival, TraceConfig, VertexSamples
 from pathreplay.transport.volume.passage import SHORT_OF, transmittance_up_to
@@ -201,17 +201,23 @@ def record_chain(
 
 @dr.syntax
 def transmittance_of_chain(
-    trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, reach: mi.Float, active: mi.Bool
+    trace: TraceConfig,
+    ray: mi.Ray3f,
+    medium: mi.MediumPtr,
+    key: mi.UInt32,
+    k: mi.UInt32,
+    reach: mi.Float,
+    active: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
     """Estimate the transmittance of a chain up to the distance ``reach`` after its k-th vertex.
 
-    Also returns the medium at this distance.
+    The chain starts in ``medium``. Also returns the medium at the distance ``reach``.
     """
     chain = chain_config(trace)
     sampler, transmittance_sampler = CounterSampler.of(key), CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_CHAIN)
     path = PathState.begin(chain, CameraStart(ray, sampler, active))
     T = mi.Spectrum(1)
-    medium, count = medium_around(trace), mi.UInt32(0)
+    count = mi.UInt32(0)
     while dr.hint(path.active & (count <= k), exclude=[trace, chain], label="pathreplay: transmittance of a chain"):
         last = count == k
         length = dr.select(last, reach, SHORT_OF * path.at.hit.t)

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -44,6 +44,9 @@ class FilmDomain(Protocol):
     ray take the place of the film position.
     """
 
+    reflects: ClassVar[bool]
+    """Whether positions beyond the border are reflected at the border. Otherwise, segments also start in a margin."""
+
     @property
     def size(self) -> mi.ScalarVector2f: ...
 
@@ -60,6 +63,9 @@ class FilmDomain(Protocol):
         The film flow is a velocity field of film positions. If the ray moves, the edges of static surfaces move
         relative to the ray.
         """
+
+    def medium(self, trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool) -> mi.MediumPtr:
+        """Return the medium at the origin of a ray. Only called in scenes with media."""
 
     def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
         """Project a point onto the film; return the film position, and whether the sensor can project and see it."""

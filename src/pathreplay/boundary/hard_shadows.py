@@ -57,7 +57,6 @@ class ShadowTest:
     def at(trace: TraceConfig, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> ShadowTest:
         """Test whether the light that ``u`` selects reaches ``x``. With media, only occlusion is tested."""
         if trace.to_sensor is not None:
-            assert isinstance(x, mi.SurfaceInteraction3f)
             return _test_of_sensor(trace, trace.to_sensor, x, u, active)
         light, Le = draw_emitter(trace.scene, x, u, active, visible=False)
         valid = active & (light.pdf != 0)
@@ -79,10 +78,10 @@ class ShadowTest:
 
 
 def _test_of_sensor(
-    trace: TraceConfig, link: SensorLink, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool
+    trace: TraceConfig, link: SensorLink, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
 ) -> ShadowTest:
     """Test whether the sensor sees ``x``. Hidden emitters (`hide_emitters`) are not seen, and do not occlude."""
-    if trace.hide_emitters and trace.traits.area_lights:
+    if trace.hide_emitters and trace.traits.area_lights and isinstance(x, mi.SurfaceInteraction3f):
         active = active & (x.shape.emitter() == None)  # noqa: E711 (an array of pointers)
     to = link.sight(x, u, active)
     lit, ray = active & to.valid, x.spawn_ray_to(to.end)

@@ -307,7 +307,7 @@ def arrival_beyond(trace: TraceConfig, at: Arrival, t: mi.Float, medium: mi.Medi
     ray, known = further(at.ray, t), mi.PreliminaryIntersection3f(at.hit)
     known.t -= t
     hit = meet(trace, ray, active)
-    if trace.hide_emitters:
+    if trace.hide_emitters and trace.to_sensor is None:
         hit = behind_emitters(trace, ray, hit, active & at.camera)
     ahead = is_boundary(trace, hit, ray, active) & (hit.t < known.t)
     behind = (known.t <= 0) | is_boundary(trace, at.hit, at.ray, active)

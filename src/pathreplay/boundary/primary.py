@@ -153,7 +153,8 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         (a, b), T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:
             t = SHORT_OF * dr.minimum(split.a.hit.t, split.b.hit.t)
-            T, medium = transmittance_of_chain(trace, ray, key, split.k, t, active)
+            medium = self.film.medium(trace, ray, active)
+            T, medium = transmittance_of_chain(trace, ray, medium, key, split.k, t, active)
             active = active & dr.any(T != 0)
             a, b = (arrival_beyond(trace, side, t, medium, active) for side in (a, b))
             lit = replace(lit, medium=medium, behind=mi.Float(0))

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -86,6 +86,7 @@ class FilmSegment(PlaneSegment):
 
 
 OnFilm = TypeVar("OnFilm", bound=FilmSegment)
+Search = TypeVar("Search", bound="FilmSearch[Any]")
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,8 @@ class FilmSearch(EdgeSearch[OnFilm]):
     length: float
 
     @classmethod
-    def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> FilmSearch[OnFilm]:
-        return cls(trace, film, SegmentDensity.uniform(film.size, length), length)
+    def of(cls: type[Search], trace: TraceConfig, film: FilmDomain, length: float) -> Search:
+        return cls(trace, film, SegmentDensity.uniform(film.size, 0.0 if film.reflects else length), length)
 
     @abstractmethod
     def probe(self, segment: OnFilm, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
@@ -166,8 +167,9 @@ class SegmentDensity:
 
     @staticmethod
     def uniform(size: mi.ScalarVector2f, l: float) -> SegmentDensity:
-        """Create a uniform density over a film of this size in pixels, for segments of length l."""
-        return SegmentDensity(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
+        """Create a uniform density over a film of this size in pixels, with a margin for segments of length l."""
+        extra = 2 * l + 1 if l else 0
+        return SegmentDensity(int(size.x + extra), int(size.y + extra), l)
 
     def refined(self, s: mi.Point2f, importance: mi.Float, unrefined: float = UNREFINED) -> SegmentDensity:
         """Increase the density in the pixels that contain the positions ``s``, and in their neighbours.

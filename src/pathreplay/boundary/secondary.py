@@ -72,7 +72,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     @staticmethod
     def of(trace: TraceConfig, film: FilmDomain, lengths: tuple[float, float]) -> SecondarySearch:
         trace = replace(trace, max_depth=min(trace.max_depth, deepest(trace)))
-        density = SegmentDensity(int(film.size.x), int(film.size.y), 0.0)
+        density = SegmentDensity.uniform(film.size, 0.0)
         return SecondarySearch(trace, film, density, lengths, dr.ones(mi.Float, VERTICES))
 
     def guided(self, n: int, seed: mi.UInt32) -> SecondarySearch:

@@ -14,6 +14,7 @@ distances.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -29,7 +30,7 @@ from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_ra
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.meet import meet
 from pathreplay.transport.path import PathState
-from pathreplay.transport.start import CameraStart, medium_around
+from pathreplay.transport.start import CameraStart
 from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Flight, TraceConfig, VertexSamples
 from pathreplay.transport.volume.media import interaction
@@ -59,6 +60,9 @@ class BeamCrossing:
         return self.shadow.gap_at(at, self.active)
 
 
+Beams = TypeVar("Beams", bound="VolumetricSearch")
+
+
 @dataclass(frozen=True)
 class VolumetricSearch(FilmSearch[BeamSegment]):
     """Edge search over film positions and distances.
@@ -69,7 +73,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
     bisection = Stream.BISECT_VOLUMETRIC
 
     @classmethod
-    def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> FilmSearch[BeamSegment]:
+    def of(cls: type[Beams], trace: TraceConfig, film: FilmDomain, length: float) -> Beams:
         return super().of(replace(trace, max_depth=min(trace.max_depth, deepest(trace))), film, length)
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> BeamSegment:
@@ -115,11 +119,15 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         It is zero if the medium does not use emitter sampling, or if paths are too short to be scattered.
         """
         trace = self.trace
-        active = observer.active & observer.at.medium.use_emitter_sampling() & (trace.max_depth > 1)
+        active, link = mi.Bool(observer.active), trace.to_sensor
+        if link is None:
+            active &= observer.at.medium.use_emitter_sampling() & (trace.max_depth > 1)
         sampler = CounterSampler.stream(segment.key, Stream.TRANSMITTANCE_OF_BEAM)
-        T = transmittance_up_to(trace, ray, segment.τ, medium_around(trace), sampler, active)[0]
+        T = transmittance_up_to(trace, ray, segment.τ, self.film.medium(trace, ray, active), sampler, active)[0]
         T *= shadow.blocked(trace, observer.at.medium, sampler, active)
         f = T * observer.selected.β * observer.towards(shadow.lit.ray.d, active)[0] * shadow.lit.Le
+        if link is not None and link.adjoint is not None:
+            f *= link.adjoint(shadow.lit.uv, ray.wavelengths, active)
         return dr.select(active, f, 0)
 
     def _hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
@@ -144,6 +152,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         records = dr.alloc_local(record_type(layout), room_for(trace))
         sampler = CounterSampler.of(segment.key)
         path = PathState.begin(trace, CameraStart(ray, sampler, active))
+        path.at.medium = self.film.medium(trace, ray, active)
         at, flight = path.at, Flight.none(trace.media)
         travelled, k, count = mi.Float(0), mi.UInt32(0), mi.UInt32(0)
         go_on = path.active & (count < room_for(trace))

@@ -131,14 +131,13 @@ class PathReplayIntegrator(PathIntegrator):
     def _light_terms(self, view: Pass, trace: TraceConfig) -> tuple[Term, ...]:
         """Return the terms of light paths; empty if there are none.
 
-        The boundary term is left out as the boundary term of camera paths is (see `_needs_edges`), with
-        ``boundary = 'primary'``, and in scenes with media.
+        The boundary term is left out as the boundary term of camera paths is (see `_needs_edges`), and with
+        ``boundary = 'primary'``.
         """
         if self.particles is None:
             return ()
         edges = ParticleBoundary(self.particles, self.boundary_spp)
-        left_out = self.boundary in ("none", "primary") or trace.media is not None
-        if left_out or not self._needs_edges(view, edges.move(view, trace)):
+        if self.boundary in ("none", "primary") or not self._needs_edges(view, edges.move(view, trace)):
             return (self.particles,)
         Boundary.require(view, self.boundary_spp)
         return self.particles, edges
@@ -391,8 +390,8 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
         if self.particles is not None and result.moves:
-            edges = self.boundary in ("auto", "all") and trace.media is None
-            omitted = ParticleBoundary(self.particles).notes(view.scene) if edges else None
+            edges = self.boundary in ("auto", "all")
+            omitted = ParticleBoundary(self.particles).notes(trace) if edges else None
             for note in particle_notes(trace, view.sensor, omitted):
                 self._warn_once(note)
             if not self.particles.caustics:

@@ -14,6 +14,8 @@ derivative of the loss is then the derivative of the sum of W_0 L_0 over all pat
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +25,7 @@ from pathreplay.adjoint.autodiff import (
     RayDerivative,
     Unreached,
     backward,
-    forward_splat,
+    forward_step,
     tangents,
 )
 from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
@@ -37,7 +39,7 @@ from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.motion import path_moves, weights_vary
 from pathreplay.transport.path import PathState
 from pathreplay.transport.sensor import SensorLink
-from pathreplay.transport.vertex import TraceConfig
+from pathreplay.transport.vertex import Step, TraceConfig
 
 # Numbers of lanes that trace light paths at the same time, on CPUs and on GPUs.
 LANES = 2**16
@@ -127,22 +129,31 @@ def particle_tangent(
             u, step = path.choose(trace, sampler)
             onward, v = path.advance(trace, u, step)
             β, lit = W * path.β, path.active & step.kept.lit
-            again, splat, δw, δ = forward_splat(trace, v, moves, δ, film.footprint, path.active)
+            again, _, δw, δ, (δc, *δh) = forward_step(trace, v, moves, δ, path.active, partial(_on_film, film))
+            assert again.splat is not None
+            at = film.footprint(again.splat.s)
             if dr.hint(moves, mode="scalar"):
                 δ, finite = δ.finite_part()
                 lost.add(path.active & ~finite & ~broken)
                 broken |= ~finite
             wavelengths = path.at.ray.wavelengths
-            c = colour(β * splat.c, wavelengths)
-            film.add(sums, splat.at, splat.at.x, splat.at.y, colour(δβ * splat.c + β * splat.δc, wavelengths), lit)
+            c = colour(β * again.splat.c, wavelengths)
+            film.add(sums, at, at.x, at.y, colour(δβ * again.splat.c + β * δc, wavelengths), lit)
             if dr.hint(moves and not film.meter, mode="scalar"):
-                film.add(sums, splat.at, splat.δx, splat.at.y, c, lit)
-                film.add(sums, splat.at, splat.at.x, splat.δy, c, lit)
-            δβ = (δβ * dr.detach(again.w) + β * δw) * v.rr_weight
+                film.add(sums, at, δh[: film.n], at.y, c, lit)
+                film.add(sums, at, at.x, δh[film.n :], c, lit)
+            δβ = (δβ * again.w + β * δw) * v.rr_weight
             path = onward
         i += lanes
 
     return film.develop(sums * film.scale(particles.number)), moves
+
+
+def _on_film(film: ParticleFilm, step: Step) -> list[Any]:
+    """Return the contribution of a step to the film, and the values of the filter around its position."""
+    assert step.splat is not None
+    at = film.footprint(step.splat.s)
+    return [step.splat.c, *at.x, *at.y]
 
 
 @dr.syntax

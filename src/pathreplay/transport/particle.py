@@ -17,6 +17,7 @@ from pathreplay.transport.start import occluder
 from pathreplay.transport.surface import normal_in_frame
 from pathreplay.transport.vertex import (
     Arrival,
+    Flight,
     SampledInMedia,
     SampledStep,
     Splat,
@@ -37,16 +38,17 @@ def choose_step(
     sampler: Sampler,
     go_on: mi.Bool,
     active: mi.Bool,
+    flight: Flight | None = None,
 ) -> SampledStep:
     """Sample a step, and test whether the sensor sees the vertex. Nothing is differentiated.
 
     At the last vertex, ``go_on`` is False, and the path is connected but not continued. If
     ``trace.to_sensor.caustics``, the first vertex is not connected, and only delta lobes continue the path after the
-    first vertex. With media, the throughput ``β`` affects the flight to the vertex (see `fly`), and the connection to
-    the sensor has a transmittance.
+    first vertex. With media, the throughput ``β`` affects the flight to the vertex (see `fly`) unless ``flight`` is
+    given, and the connection to the sensor has a transmittance.
     """
     link, ctx = _link(trace), mi.BSDFContext(mi.TransportMode.Importance)
-    v = arrive.choose(trace, at, sampler, β, active)
+    v = arrive.choose(trace, at, sampler, β, active, flight)
     to = _sight(link, v, u, active)
     lit = active & to.valid & _connects(trace, v)
     if link.caustics:

@@ -8,11 +8,10 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.meet import meet
 from pathreplay.transport.vertex import Arrival, TraceConfig
-from pathreplay.transport.volume.passage import skip_null
+from pathreplay.transport.volume.passage import first_behind, is_boundary, skip_null
 
 
 class Start(Protocol):
@@ -59,37 +58,33 @@ class CameraStart:
         return self.ray.o, self.ray.d
 
 
-@dr.syntax
 def behind_emitters(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """Return the first hit that is not on an area emitter. Its distance is measured from the origin of ``ray``.
+    """Return the first hit that is not on an area emitter: see `first_behind`.
 
-    Mitsuba's ``skip_area_emitters`` measures the distance from the last emitter instead.
+    Mitsuba's ``skip_area_emitters`` measures the distance of this hit from the last emitter instead.
     """
-    here, onward, gone = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(0)
-    passing = active & here.is_valid() & (here.shape.emitter() != None)  # noqa: E711 (an array of pointers)
-    while dr.hint(passing, exclude=[trace], label="pathreplay: behind emitters"):
-        si = here.compute_surface_interaction(onward, compat.minimal(), passing)
-        behind = si.spawn_ray(onward.d)
-        gone += dr.norm(behind.o - onward.o)
-        onward = behind
-        here = meet(trace, onward, passing)
-        passing &= here.is_valid() & (here.shape.emitter() != None)  # noqa: E711
-    here.t += gone
-    return here
+    return first_behind(trace, ray, hit, _is_emitter, active)
 
 
 def occluder(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-    """Return the first hit on the way from a light path to the sensor. Hidden emitters occlude nothing.
+    """Return the first hit on the way from a light path to the sensor.
 
-    ``ray`` ends at the sensor.
+    Hidden emitters occlude nothing, and neither do null boundaries in scenes with media. ``ray`` ends at the sensor.
     """
+    hides, clear = trace.hide_emitters and trace.traits.area_lights, trace.skips_null or trace.media is not None
+
+    def passes(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+        passed = is_boundary(trace, hit, ray, active) if clear else mi.Bool(False)
+        return passed | _is_emitter(hit, ray, active) if hides else passed
+
     hit = meet(trace, ray, active)
-    if trace.hide_emitters and trace.traits.area_lights:
-        hit = behind_emitters(trace, ray, hit, active)
-        hit.valid = hit.is_valid() & (hit.t < ray.maxt)  # `behind_emitters` ignores the end of the ray
-    return hit
+    return first_behind(trace, ray, hit, passes, active) if hides or clear else hit
+
+
+def _is_emitter(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+    return hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
 
 
 def medium_around(trace: TraceConfig) -> mi.MediumPtr:

@@ -54,7 +54,7 @@ def choose_step(
     """
     at, go_on, active = visit.at, visit.go_on, visit.active
     if trace.to_sensor is not None:
-        return particle.choose_step(trace, at, visit.β, u, sampler, go_on, active)
+        return particle.choose_step(trace, at, visit.β, u, sampler, go_on, active, flight)
     ctx = mi.BSDFContext() if ctx is None else ctx
     v = arrive.choose(trace, at, sampler, visit.β, active, flight)
     link = connect.choose(trace, v, u, sampler, go_on)

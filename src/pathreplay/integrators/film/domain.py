@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +13,8 @@ from pathreplay.integrators.film.image import transposed
 from pathreplay.platform.registration import mitsuba_integrator
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
+from pathreplay.transport.start import medium_around
+from pathreplay.transport.vertex import TraceConfig
 
 PROJECTING = frozenset({"PerspectiveCamera", "ThinLensCamera"})
 """Classes of sensors that can project a point onto the film."""
@@ -35,6 +38,7 @@ class FilmPlaces:
     view: Pass
     corner: mi.ScalarPoint2f  # position of the domain's lower corner on the film, in pixels
     size: mi.ScalarVector2f
+    reflects: ClassVar[bool] = False
 
     @staticmethod
     def of(view: Pass) -> FilmPlaces:
@@ -70,6 +74,9 @@ class FilmPlaces:
     def flows(self, s: mi.Point2f) -> mi.Bool:
         flow = self.view.flow
         return mi.Bool(False) if flow is None else flow.leaves_rest_at(self.in_sensor(s))
+
+    def medium(self, trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool) -> mi.MediumPtr:
+        return medium_around(trace)
 
     def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
         sensor = self.view.sensor

@@ -11,8 +11,9 @@ import mitsuba as mi
 from pathreplay.adjoint.autodiff import NonFiniteCounter
 from pathreplay.adjoint.baseline import Baseline
 from pathreplay.boundary.edges import Edges, edges_backward, edges_forward
-from pathreplay.boundary.emission import EmissionSearch
+from pathreplay.boundary.emission import EmissionBeamSearch, EmissionSearch
 from pathreplay.boundary.primary import FilmCrossing
+from pathreplay.boundary.volumetric import BeamCrossing
 from pathreplay.integrators.boundary_term import Boundary, segments_of
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
@@ -38,8 +39,9 @@ class ParticleBoundary(Term):
     """The boundary term of light paths.
 
     It contains the edges between an emitter and the first vertex with a smooth lobe, directly or through chains of
-    delta lobes, and the edges between this vertex and the sensor. Visibility after this vertex is not differentiated,
-    and neither is the light of emitters with `has_jumps`.
+    delta lobes, and the edges between this vertex and the sensor. In media, it also contains the edges between the
+    points of the first ray and the sensor. All other visibility is not differentiated, and neither is the light of
+    emitters with `has_jumps`.
     """
 
     particles: ParticleTerm
@@ -59,17 +61,22 @@ class ParticleBoundary(Term):
         work = self.particles.work(view, trace)
         assert work is not None
         link, particles, film = work
-        search, edges = self._edges(view, link, particles)
-        (crossing,), key = edges.crossings, edges.path.key
-        assert isinstance(crossing, FilmCrossing)
-        sides, shadow = crossing.sides, crossing.sides.shadow
-        assert shadow is not None
-        δ, sums = edges_forward(search.chain, search.film, edges), dr.zeros(mi.Float, 4 * film.pixels)
-        for path, weight in zip(sides.paths(), (δ, -δ), strict=True):
-            splat_path(search.onward, CounterSampler.at_vertex(key, sides.k), path, weight, film, sums)
-        at = film.footprint(shadow.lit.uv)
-        c = colour(δ * sides.shadow_jump(search.onward, key), edges.path.ray.wavelengths)
-        film.add(sums, at, at.x, at.y, c, shadow.exists)
+        sums = dr.zeros(mi.Float, 4 * film.pixels)
+        for search, edges in self._searches(view, link, particles):
+            (crossing,), key = edges.crossings, edges.path.key
+            δ = edges_forward(search.along, search.film, edges)
+            if isinstance(search, EmissionSearch):
+                assert isinstance(crossing, FilmCrossing)
+                sides, shadow = crossing.sides, crossing.sides.shadow
+                assert shadow is not None
+                for path, weight in zip(sides.paths(), (δ, -δ), strict=True):
+                    splat_path(search.onward, CounterSampler.at_vertex(key, sides.k), path, weight, film, sums)
+                δ *= sides.shadow_jump(search.onward, key)
+            else:
+                assert isinstance(crossing, BeamCrossing)
+                shadow = crossing.shadow
+            at = film.footprint(shadow.lit.uv)
+            film.add(sums, at, at.x, at.y, colour(δ, edges.path.ray.wavelengths), shadow.exists)
         return TermResult(film.develop(sums * (film.scale(1) / CELLS**2)))
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
@@ -77,22 +84,34 @@ class ParticleBoundary(Term):
         assert work is not None
         link, particles, film = work
         link = with_adjoint(link, film, film.adjoint(grad_in) * (film.scale(1) / CELLS**2))
-        search, edges = self._edges(view, link, particles)
-        edges_backward(search.chain, search.film, edges, mi.Spectrum(1), lost)
+        paths = 0
+        for search, edges in self._searches(view, link, particles):
+            edges_backward(search.along, search.film, edges, mi.Spectrum(1), lost)
+            paths += dr.width(edges.path.s)
         dr.eval()
-        return TermResult(lost=lost.count, paths=dr.width(edges.path.s), moves=True)
+        return TermResult(lost=lost.count, paths=paths, moves=True)
 
-    def notes(self, scene: mi.Scene) -> Iterator[str]:
+    def notes(self, trace: TraceConfig) -> Iterator[str]:
         """Yield what the term leaves out in a scene."""
         if self.particles.max_depth > 2 + self.particles.caustics:
-            yield "edges that light meets after its first rough surface"
-        yield from (f"edges in the light of emitter '{each.id()}'" for each in scene.emitters() if has_jumps(each))
+            after = "its first rough surface" if trace.media is None else "its first rough surface or collision"
+            yield f"edges that light meets after {after}"
+        yield from (
+            f"edges in the light of emitter '{each.id()}'" for each in trace.scene.emitters() if has_jumps(each)
+        )
 
-    def _edges(self, view: Pass, trace: TraceConfig, particles: Particles) -> tuple[EmissionSearch, Edges]:
+    def _searches(
+        self, view: Pass, trace: TraceConfig, particles: Particles
+    ) -> Iterator[tuple[EmissionSearch | EmissionBeamSearch, Edges]]:
+        """Run the edge searches that the scene requires, and yield each search with its edges."""
         tables = facts_of(view.scene).recorded_tables(trace.traits.tables, edges=True)
         trace = Boundary.informed(replace(view, flow=None), replace(trace, traits=replace(trace.traits, tables=tables)))
         if any(shape.is_emitter() for shape in trace.traits.moving or ()):  # every edge moves relative to such light
             trace = replace(trace, traits=replace(trace.traits, moving=None))
-        search = EmissionSearch.of(trace, EmissionDomain(trace, particles.emission), LENGTH)
-        n = segments_of(view, FilmPlaces.of(view), self.spp)
-        return search, search.find(n, max(n // CLOSER, 1), Stream.PARTICLE_EDGES.of(view.opaque_seed))
+        domain, n = EmissionDomain(trace, particles.emission), segments_of(view, FilmPlaces.of(view), self.spp)
+        kinds: list[type[EmissionSearch | EmissionBeamSearch]] = [EmissionSearch]
+        if trace.media is not None and not self.particles.caustics:
+            kinds.append(EmissionBeamSearch)
+        for kind in kinds:
+            search = kind.of(trace, domain, LENGTH)
+            yield search, search.find(n, max(n // CLOSER, 1), Stream.PARTICLE_EDGES.of(view.opaque_seed))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -10,7 +11,9 @@ import mitsuba as mi
 from pathreplay.particles.start import Emission, EmitterSamples
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
+from pathreplay.transport.meet import meet
 from pathreplay.transport.vertex import TraceConfig
+from pathreplay.transport.volume.passage import medium_at_origin
 
 CELLS = 32
 """Number of cells along a side of the unit square. The density of segments is constant in each cell. With more cells
@@ -33,6 +36,7 @@ class EmissionDomain:
 
     trace: TraceConfig
     emission: Emission
+    reflects: ClassVar[bool] = True
 
     @property
     def size(self) -> mi.ScalarVector2f:
@@ -56,6 +60,9 @@ class EmissionDomain:
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
         return mi.Bool(False)
+
+    def medium(self, trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool) -> mi.MediumPtr:
+        return medium_at_origin(trace, ray, meet(trace, ray, active), self.emission.outside, active)
 
     def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
         return mi.Point2f(0), mi.Bool(False)

@@ -5,6 +5,9 @@ The search for edges ignores null boundaries, because light passes straight thro
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 
@@ -21,25 +24,37 @@ SHORT_OF = 1 - 1e-3
 value is slightly below 1, so that the surfaces at the edge are at positive distances on the remaining parts of both
 rays."""
 STEP = 1e-5
-"""Offset behind a null boundary at which the next ray starts, relative to distance and coordinates."""
+"""Offset behind a surface at which the next ray starts, relative to distance and coordinates."""
+Passes = Callable[["mi.PreliminaryIntersection3f", "mi.Ray3f", "mi.Bool"], "mi.Bool"]
 
 
 @dr.syntax
-def skip_null(
-    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+def first_behind(
+    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, passes: Passes, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """Return the first hit that is not on a null boundary. Its distance is measured from the origin of ``ray``."""
+    """Return the first hit on a surface that the ray does not pass. ``hit`` is the first hit on any surface.
+
+    The distance of the result is measured from the origin of ``ray``. ``passes`` maps a hit, its ray and a mask to the
+    lanes in which the ray passes through the surface.
+    """
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
-    passing = active & is_boundary(trace, here, ray, active)
-    while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond null boundaries"):
+    passing = active & passes(here, ray, active)
+    while dr.hint(passing, exclude=[trace, ray, passes], label="pathreplay: beyond surfaces"):
         # The new origin stays on the ray. `spawn_ray` would move the origin sideways.
         gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
         onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
         here = meet(trace, onward, passing)
         t = gone + here.t
-        passing &= is_boundary(trace, here, onward, passing)
+        passing &= passes(here, onward, passing)
     here.t = t
     return here
+
+
+def skip_null(
+    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> mi.PreliminaryIntersection3f:
+    """Return the first hit that is not on a null boundary: see `first_behind`."""
+    return first_behind(trace, ray, hit, partial(is_boundary, trace), active)
 
 
 def is_boundary(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
