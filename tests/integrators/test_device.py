@@ -112,7 +112,7 @@ def test_auto_walks_twice_where_records_would_take_too_much_and_says_so_once(
 def test_what_must_be_recorded_is_refused_before_anything_is_launched(pretend: Any) -> None:
     pretend(LAPTOP)
     most = deepest(walk_of(room()), LAPTOP)
-    with pytest.raises(PathreplayError, match=rf"more than the sweep driver can hold \({most}\)"):
+    with pytest.raises(PathreplayError, match=rf"more than adjoint = 'recorded' can hold \({most}\)"):
         gradient(mi.load_dict({"type": "pathreplay", "max_depth": 1500, "adjoint": "recorded"}))
 
 

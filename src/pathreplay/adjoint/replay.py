@@ -17,7 +17,7 @@ from pathreplay.adjoint.autodiff import NonFiniteCounter, backward
 from pathreplay.adjoint.null_branching import Branch, branch_backward
 from pathreplay.adjoint.primal import path_radiance
 from pathreplay.adjoint.ray_jacobian import Recovery, has_smooth_lobes
-from pathreplay.adjoint.record import MAX_DEPTH_MEDIA
+from pathreplay.adjoint.record import deepest
 from pathreplay.adjoint.replay_attached import replay_attached
 from pathreplay.errors import PathreplayError
 from pathreplay.transport.motion import path_moves
@@ -51,7 +51,7 @@ def replay(
     elif trace.media is not None:
         raise PathreplayError(
             "adjoint = 'replay' does not support parameters that move paths in scenes with media: use "
-            f"adjoint = 'recorded', with max_depth of at most {MAX_DEPTH_MEDIA}"
+            f"adjoint = 'recorded', with max_depth of at most {deepest(trace)}"
         )
     else:
         if has_smooth_lobes(trace):

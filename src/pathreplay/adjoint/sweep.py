@@ -36,9 +36,10 @@ def sweep(
     Raises PathreplayError if ``max_depth`` exceeds `deepest`, or if the paths depend on no parameter with gradients.
     """
     if trace.max_depth > deepest(trace):
+        remedy = "adjoint = 'replay', which has no limit"
         raise PathreplayError(
-            f"max_depth = {trace.max_depth} is more than the sweep driver can hold ({deepest(trace)}): "
-            "use adjoint = 'replay', which has no limit"
+            f"max_depth = {trace.max_depth} is more than adjoint = 'recorded' can hold ({deepest(trace)}): "
+            + (f"use {remedy}" if trace.media is None else f"lower it or, if no parameter moves paths, use {remedy}")
         )
     path = PathState.begin(trace, start, sustained=True)
     ray0 = path.at.ray

@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from pathreplay.boundary.crofton import Survey
 from pathreplay.boundary.observer import ObserverVertex
+from pathreplay.transport.velocity import blend_length_at
 from pathreplay.transport.vertex import TraceConfig
 
 WITHIN = 2.0
@@ -68,8 +69,7 @@ def closeness(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Float
 
     The direction to the hit turns by the angle 1 / r if the hit point moves by one unit of length.
     """
-    shape = dr.reinterpret_array(mi.UInt32, hit.shape)
-    h0 = dr.gather(mi.Float, trace.traits.tables.blend_lengths, shape, hit.is_valid())
+    h0 = blend_length_at(trace.traits.tables.blend_lengths, hit)
     return dr.select(hit.is_valid(), dr.rcp(hit.t + WITHIN * h0), 0)
 
 

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.adjoint.record import Layout, record
+from pathreplay.adjoint.record import Layout, record, room_for
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
@@ -95,7 +95,7 @@ def choose_vertex(
     are written to ``records`` unless ``records`` is None. A path with `max_depth` vertices scatters no light at its
     last vertex, which is therefore not traced.
     """
-    trace = replace(trace, max_depth=max(trace.max_depth - 1, 0))
+    room, trace = room_for(trace), replace(trace, max_depth=max(trace.max_depth - 1, 0))
     path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)))
     if dr.hint(trace.max_depth == 1 and trace.media is None and records is None, mode="scalar"):
         return None, _first_vertex(trace, path, flows)
@@ -105,7 +105,7 @@ def choose_vertex(
     mass = mi.Float(0)
     count = mi.UInt32(0)
     moves = mi.Bool(flows)
-    while dr.hint(path.active, exclude=[trace, layout, shares], label="pathreplay: choose a vertex"):
+    while dr.hint(path.active, exclude=[trace, layout, shares, room], label="pathreplay: choose a vertex"):
         choice = sampler.next_1d()
         u, step = path.choose(trace, sampler)
         scatters, w = may_see(trace, path.at, step)
@@ -125,6 +125,8 @@ def choose_vertex(
             records[count] = record(layout, v)
         path = onward
         count += 1
+        if dr.hint(trace.media is not None, mode="scalar"):  # null boundaries may fill the record
+            path.active &= count < room
     chosen.β *= mass / dr.maximum(chosen.mass, dr.smallest(mi.Float))
     return records, chosen
 
@@ -213,16 +215,17 @@ class ObserverVertex:
         """
         return t > omitted_distance(dr.max(dr.abs(self.origin.p)))
 
-    def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
-        """Return whether the direction from the observer to ``hit`` follows the hit point when the scene moves.
+    def holds(self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+        """Return whether the direction of ``ray``, from the observer to ``hit``, follows the hit point.
 
         A direction from a point in a medium follows the hit point only if that surface scatters or emits light: see
         `scatter`.
         """
-        active = active & ~self.keeps_direction & ~scatter.is_seen_through(self.trace, hit)
+        active = active & ~self.keeps_direction & ~scatter.is_seen_through(self.trace, hit, ray)
         if self.trace.media is None:
             return active
-        seen = is_smooth(hit.shape.bsdf()) | (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
+        shape = shape_met(self.trace, hit, ray, active)
+        seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
         return active & (~self.event | seen)
 
     def hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:

@@ -230,6 +230,6 @@ class MovedSide:
         At a crease, B is `OcclusionEdge.crease_gap` divided by `OcclusionEdge.slope`.
         """
         e, hit, lengths = self.edge, self.side.hit, self.edge.observer.trace.traits.tables.blend_lengths
-        d, _ = moved_direction(lengths, at, self.side.ray.d, hit, e.observer.holds(hit, e.active))
+        d, _ = moved_direction(lengths, at, self.side.ray.d, hit, e.observer.holds(hit, self.side.ray, e.active))
         ray = mi.Ray3f(at.spawn_ray(dr.detach(d)).o, d)
         return dr.select(e.active, dr.select(e.is_crease, e.crease_gap(ray, at.n) / e.slope, dr.dot(e.n, d)), 0)

@@ -43,10 +43,6 @@ class BeamSegment(FilmSegment):
 
     τ: mi.Float
 
-    @property
-    def emitter_sample(self) -> mi.Point2f:
-        return CounterSampler.stream(self.key, Stream.BEAM_EMITTER).next_2d()
-
 
 @dataclass
 class BeamCrossing:
@@ -81,10 +77,9 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         sampler = CounterSampler.stream(key, Stream.BEAM)
         w = heading(sampler.next_1d())
         c, density = self.density.draw(*quasi_random(i, n, Stream.VOLUMETRIC_CENTRES.of(seed)))
-        reach = self._reach(dr.detach(self.film.ray(c, key)[0]))
-        τ = sampler.next_1d() * reach
-        ok = dr.isfinite(reach) & (reach > 0)
-        density = density * dr.select(ok, dr.rcp(reach), 1)
+        τ, pdf = self._distance(dr.detach(self.film.ray(c, key)[0]), sampler.next_1d())
+        ok = dr.isfinite(τ) & (pdf > 0)
+        density = density * dr.select(ok, pdf, 1)
         return BeamSegment(c, w, mi.Float(self.length), key, density, ok, dr.select(ok, τ, 0))
 
     def probe(self, segment: BeamSegment, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
@@ -96,7 +91,8 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         ray = dr.detach(self.film.ray(segment.at(t), segment.key)[0])
         hit = self._hit(ray, active)
         visible = active & ~(hit.is_valid() & (hit.t < segment.τ))
-        return visible, ShadowTest.at(self.trace, _point_on(ray, segment.τ), segment.emitter_sample, visible)
+        u = CounterSampler.stream(segment.key, Stream.BEAM_EMITTER).next_2d()
+        return visible, ShadowTest.at(self.trace, _point_on(ray, segment.τ), u, visible)
 
     def edge(self, segment: BeamSegment, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
         (visible_a, test_a), (visible_b, test_b) = (self._shadow_test(segment, t, active) for t in (a, b))
@@ -134,14 +130,21 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         """Return the first hit of a ray on a surface that is not a null boundary."""
         return skip_null(self.trace, ray, meet(self.trace, ray, active), active)
 
-    def _reach(self, ray: mi.Ray3f) -> mi.Float:
-        """Return the largest distance τ that is sampled along a ray.
+    def _distance(self, ray: mi.Ray3f, u: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Sample a distance τ along a ray, up to its hit; return it with its density.
 
-        If the ray hits a surface, the result is the distance of the hit. Otherwise, the result lies behind the scene.
+        If the ray leaves the scene, the distances end behind the scene. In media without bounds, they do not end: half
+        of them lie behind the scene.
         """
         hit, box = self._hit(ray, mi.Bool(True)), self.trace.scene.bbox()
         far = dr.norm(ray.o - box.center()) + 0.5 * dr.norm(box.extents())
-        return dr.select(hit.is_valid(), hit.t, far)
+        reach = dr.select(hit.is_valid(), hit.t, far)
+        τ, pdf = u * reach, dr.rcp(reach)
+        if self.trace.media.bounded:
+            return τ, pdf
+        beyond = far * u / (1 - u)
+        pdf_beyond = far / dr.square(far + beyond)
+        return dr.select(hit.is_valid(), τ, beyond), dr.select(hit.is_valid(), pdf, pdf_beyond)
 
     @dr.syntax
     def _particle(
@@ -155,8 +158,8 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         path.at.medium = self.film.medium(trace, ray, active)
         at, flight = path.at, Flight.none(trace.media)
         travelled, k, count = mi.Float(0), mi.UInt32(0), mi.UInt32(0)
-        go_on = path.active & (count < room_for(trace))
-        while dr.hint(go_on, exclude=[trace, layout, self], label="pathreplay: to a particle"):
+        room, go_on = room_for(trace), mi.Bool(path.active)
+        while dr.hint(go_on, exclude=[trace, layout, self, room], label="pathreplay: to a particle"):
             length = dr.select(path.at.hit.is_valid(), path.at.hit.t, dr.inf)
             event = (travelled + length > τ) & (path.at.medium != None)  # noqa: E711 (an array of pointers)
             event_flight = Flight.none(trace.media)
@@ -168,7 +171,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
             at, k = dr.select(event, path.at, at), dr.select(event, count, k)
             flight = dr.select(event, event_flight, flight)
             travelled += dr.norm(onward.at.ray.o - path.at.ray.o)
-            go_on = onward.active & step.null & ~event & (travelled < τ)
+            go_on = onward.active & step.null & ~event & (travelled < τ) & (count + 1 < room)
             path = onward
             count += 1
         active = active & flight.event

@@ -12,6 +12,7 @@ from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.emitters import area_growth
 from pathreplay.transport.facts.nodes import is_mesh
+from pathreplay.transport.facts.traits import is_painted
 from pathreplay.transport.meet import meet
 from pathreplay.transport.start import medium_around
 from pathreplay.transport.vertex import Arrival, TraceConfig, reciprocal
@@ -159,8 +160,9 @@ class Emission:
             here = emitter == mi.EmitterPtr(each)
             ray.o, ray.d = dr.select(here, o, ray.o), dr.select(here, d, ray.d)
         if trace.traits.lights_deform:
-            # Mitsuba's `sample_ray` omits the derivative of the areas of triangles.
-            weight *= area_growth(*_origin(trace, emitter, ray, active))
+            # Mitsuba's `sample_ray` omits the derivative of the areas of triangles, unless the radiance is textured.
+            hit, back, on_mesh = _origin(trace, emitter, ray, active)
+            weight *= area_growth(hit, back, on_mesh & ~mi.Bool(is_painted(emitter)))
         if self.rounded:
             rounded = active & _is_one_of(self.rounded, emitter)
             weight = dr.select(~rounded | _outwards(trace, emitter, ray, rounded), weight, 0)

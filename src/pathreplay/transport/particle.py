@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport import arrive, scatter
-from pathreplay.transport.sensor import SensorLink, Sighting
+from pathreplay.transport.sensor import SensorLink
 from pathreplay.transport.start import occluder
 from pathreplay.transport.surface import normal_in_frame
 from pathreplay.transport.vertex import (
@@ -43,13 +43,13 @@ def choose_step(
     """Sample a step, and test whether the sensor sees the vertex. Nothing is differentiated.
 
     At the last vertex, ``go_on`` is False, and the path is connected but not continued. If
-    ``trace.to_sensor.caustics``, the first vertex is not connected, and only delta lobes continue the path after the
-    first vertex. With media, the throughput ``β`` affects the flight to the vertex (see `fly`) unless ``flight`` is
-    given, and the connection to the sensor has a transmittance.
+    ``trace.to_sensor.caustics``, the first vertex is not connected, and only delta lobes continue the path there. With
+    media, the connection to the sensor has a transmittance, and the throughput ``β`` affects the flight to the vertex
+    (see `fly`) unless ``flight`` is given.
     """
     link, ctx = _link(trace), mi.BSDFContext(mi.TransportMode.Importance)
     v = arrive.choose(trace, at, sampler, β, active, flight)
-    to = _sight(link, v, u, active)
+    to = link.sight(v.origin, u.light, active)
     lit = active & to.valid & _connects(trace, v)
     if link.caustics:
         lit &= ~at.camera
@@ -82,7 +82,7 @@ def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active:
     link, ctx, lit = _link(trace), mi.BSDFContext(mi.TransportMode.Importance), again.kept.lit
     v = arrive.repeat(trace, again, attached, active)
     with dr.suspend_grad(when=not attached):
-        to = _sight(link, v, again.u, lit)
+        to = link.sight(v.origin, again.u.light, lit)
         v.n = normal_in_frame(again.at.hit, again.at.ray, v.si, active)
     c, (w, d, pdf) = scatter.towards(v, ctx, to.d, lit)[0] * to.W, scatter.repeat(trace, v, again, ctx, attached)
     if v.inside is not None:
@@ -96,10 +96,6 @@ def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active:
 def _link(trace: TraceConfig) -> SensorLink:
     assert trace.to_sensor is not None
     return trace.to_sensor
-
-
-def _sight(link: SensorLink, v: arrive.Vertex, u: VertexSamples, active: mi.Bool) -> Sighting:
-    return link.sight(v.origin, u.light, active)
 
 
 def _connects(trace: TraceConfig, v: arrive.Vertex) -> mi.Bool:

@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from pathreplay.transport.adjoint_bsdf import delta_adjoint, smooth_adjoint
 from pathreplay.transport.arrive import Vertex
+from pathreplay.transport.signature import shape_met
 from pathreplay.transport.velocity import moved_direction
 from pathreplay.transport.vertex import (
     Arrival,
@@ -146,7 +147,8 @@ def _at_surface(
     smooth = active & ~kept.delta
     d, J = kept.d, mi.Float(1)
     if attached:
-        holds = smooth & ~keeps_direction(trace, si, smooth) & ~is_seen_through(trace, again.hit_next)
+        ray = dr.detach(si.spawn_ray(kept.d))
+        holds = smooth & ~keeps_direction(trace, si, smooth) & ~is_seen_through(trace, again.hit_next, ray)
         d, J = moved_direction(trace.traits.tables.blend_lengths, si, kept.d, again.hit_next, holds)
 
     if trace.resamples:
@@ -199,8 +201,8 @@ def may_keep_directions(trace: TraceConfig) -> bool:
     return trace.may_slide and trace.traits.glossy
 
 
-def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Return the lanes whose hit surface passes part of the light unscattered.
+def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Bool:
+    """Return the lanes in which the surface that ``ray`` hit passes part of the light unscattered.
 
     A smooth continuation to such a surface has a fixed direction. A direction that followed the motion of the surface
     would move across other surfaces behind it, and across their edges. With a fixed direction, the outline of the
@@ -209,7 +211,7 @@ def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi
     """
     if not (trace.may_slide and trace.traits.veils):
         return mi.Bool(False)
-    return mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Null)
+    return mi.has_flag(shape_met(trace, hit, ray, hit.is_valid()).bsdf().flags(), mi.BSDFFlags.Null)
 
 
 def _followed(trace: TraceConfig, v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
@@ -272,9 +274,10 @@ def _at_particle(
     kept, hit_next = again.kept, again.hit_next
     d, J = kept.d, mi.Float(1)
     if attached:
-        shape = hit_next.shape
+        ray = dr.detach(v.origin.spawn_ray(kept.d))
+        shape = shape_met(trace, hit_next, ray, active)
         seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
-        holds = active & hit_next.is_valid() & seen & ~is_seen_through(trace, hit_next)
+        holds = active & hit_next.is_valid() & seen & ~is_seen_through(trace, hit_next, ray)
         d, J = moved_direction(trace.traits.tables.blend_lengths, v.origin, kept.d, hit_next, holds)
     f, pdf = v.inside.phase.eval_pdf(mi.PhaseFunctionContext(None), v.inside.mei, d, active)
     pdf = dr.replace_grad(kept.pdf, dr.select(active, pdf, 0)) if attached else kept.pdf

@@ -29,12 +29,6 @@ class Sighting:
     W: mi.Float  # importance divided by the density of the aperture sample
     valid: mi.Bool  # without occluders, the sensor sees the point; ``s`` may be up to ``reach`` pixels off the film
 
-    @staticmethod
-    def none() -> Sighting:
-        """Create an invalid connection."""
-        zero = mi.Vector3f(0)
-        return Sighting(zero, mi.Point3f(zero), mi.Point2f(0), mi.Float(0), mi.Bool(False))
-
 
 @dataclass(frozen=True)
 class SensorLink:

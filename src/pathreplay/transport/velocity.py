@@ -71,12 +71,18 @@ def moved_direction(
     # log J is differentiated instead of J, because powers of the tiny distances in corners would overflow.
     log_J_H = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
 
-    h0 = dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, hit.shape), ok)
+    h0 = blend_length_at(lengths, hit, ok)
     n_x = dr.detach(origin.n)
     d_D = dr.cross(dr.cross(n_x, origin.n), dr.detach(d))  # its derivative is V_D
     φ, slope = _share(h0, dr.detach(y), n_x, dr.detach(towards), ok)
     log_J = φ * log_J_H + dr.dot(slope, d_H - d_D)
     return dr.select(ok, dr.replace_grad(d, φ * d_H + (1 - φ) * d_D), d), dr.replace_grad(mi.Float(1), log_J)
+
+
+def blend_length_at(lengths: mi.Float, hit: mi.PreliminaryIntersection3f, active: mi.Bool | bool = True) -> mi.Float:
+    """Return the `blend_length` of the shape that was hit; inside an instance, that of the instance. Zero on a miss."""
+    shape = dr.select(hit.instance != None, hit.instance, hit.shape)  # noqa: E711 (an array of pointers)
+    return dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, shape), active & hit.is_valid())
 
 
 def jumps_at_facets(
@@ -87,9 +93,8 @@ def jumps_at_facets(
     ``p`` and ``n`` are position and normal at the hit. Near the surface, φ depends on the plane of the triangle.
     """
     towards = p - origin.p
-    h0 = dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())
-    near = dr.abs(dr.dot(n, towards)) * dr.norm(towards) < CLOSE * dr.square(h0)
-    return hit.is_valid() & hit.shape.is_mesh() & near
+    near = dr.abs(dr.dot(n, towards)) * dr.norm(towards) < CLOSE * dr.square(blend_length_at(lengths, hit))
+    return hit.is_valid() & (hit.shape.is_mesh() | (hit.instance != None)) & near  # noqa: E711 (an array of pointers)
 
 
 def held_direction(

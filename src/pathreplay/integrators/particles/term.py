@@ -61,7 +61,9 @@ class ParticleTerm(Term):
             raise Unreached("no light path starts at an emitter of the scene")
         moves = particle_sweep(*work, grad_in, lost)
         dr.eval()
-        return TermResult(lost=lost.count, paths=work[1].number, moves=True) if moves else TermResult()
+        if not moves and trace.media is None:  # no path can be incomplete
+            return TermResult()
+        return TermResult(lost=lost.count, paths=work[1].number, moves=moves)
 
     def work(self, view: Pass, trace: TraceConfig) -> tuple[TraceConfig, Particles, ParticleFilm] | None:
         """Return the configuration of light paths, the paths and the film; None if no light path starts in the scene.

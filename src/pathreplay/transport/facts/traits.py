@@ -92,7 +92,7 @@ class Traits:
     skies_move: bool = False  # a parameter of a `sunsky`
     lights_vary: bool = False  # any parameter of an emitter, or of an emissive shape
     moving: tuple[mi.Shape, ...] | None = None  # shapes that may move; None: all shapes and the camera
-    turning: tuple[mi.Shape, ...] = ()  # static shapes whose BSDF has gradients: rays that continue there may move
+    turning: tuple[mi.Shape, ...] = ()  # static shapes with gradients in a BSDF, medium or emitter: rays may turn there
 
 
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
@@ -107,6 +107,8 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     attachables = _attachables(nodes, shapes)
     others = [bsdf for bsdf in bsdfs if not _is_attachable(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
     coarse = [shape for shape in shapes if is_mesh(shape) and is_coarse(shape)]
+    masked = [n for bsdf in bsdfs if bsdf.class_name() == MASK for n in nodes_of(bsdf) if isinstance(n, mi.BSDF)]
+    narrow = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
         lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
@@ -120,14 +122,14 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         sphere_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
         coarse_meshes=bool(coarse),
         brushed_meshes=any(is_brushed(shape.bsdf()) for shape in coarse),
-        painted_meshes=any(is_painted(mesh.emitter()) for mesh in _mesh_emitters(shapes)),
+        painted_meshes=any(is_painted(s.emitter()) for s in shapes if s.is_emitter() and is_mesh(s)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         copies=any(shape.class_name() == INSTANCE for shape in shapes),
         splines=any(shape.shape_type() == mi.ShapeType.BSplineCurve for shape in shapes),
         veils=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf) for bsdf in bsdfs),
-        masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
-        narrow=_is_narrow(bsdfs),
-        glossy=_is_narrow(bsdfs) and not any(node.class_name() == CHECKERBOARD for node in nodes),
+        masks_mirrors=any(map(_delta_lobes, masked)),
+        narrow=narrow,
+        glossy=narrow and not any(node.class_name() == CHECKERBOARD for node in nodes),
         outlines=not _seamless(shapes, nodes),
     )
 
@@ -237,10 +239,6 @@ def scene_bounds(box: mi.ScalarBoundingBox3f) -> mi.Float:
     return _array(mi.Float, np.array([*(float(x) for x in box.center()), 0.5 * np.linalg.norm(extents)]))
 
 
-def _mesh_emitters(shapes: list[mi.Shape]) -> list[mi.Mesh]:
-    return [shape for shape in shapes if shape.is_emitter() and is_mesh(shape)]
-
-
 def _bounding_sphere(shape: mi.Shape) -> np.ndarray:
     """Return centre and radius of the bounding sphere of an emissive shape.
 
@@ -285,11 +283,6 @@ def is_painted(emitter: mi.Emitter | mi.EmitterPtr) -> bool | mi.Bool:
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
-def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
-    """Return whether a surface may have a narrow smooth lobe."""
-    return any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
-
-
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
     """Return whether the scene has a single shape, from whose points no edge is visible.
 
@@ -301,10 +294,6 @@ def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
     textured = any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes)
     kind = shapes[0].shape_type()
     return kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk) or (kind == mi.ShapeType.Sphere and not textured)
-
-
-def _nested(bsdf: mi.BSDF) -> mi.BSDF:
-    return next(node for node in nodes_of(bsdf) if isinstance(node, mi.BSDF))
 
 
 def _delta_lobes(bsdf: mi.BSDF) -> int:
