@@ -457,7 +457,9 @@ def test_chains_in_fog_are_not_ended_by_roulette() -> None:
     with dr.suspend_grad():
         s = mi.Point2f(quasi_random(key, 2000, mi.UInt32(1))) * places.size
         ray, reach = places.ray(s, key)[0], 0.5
-        T, _ = transmittance_of_chain(trace, ray, key, mi.UInt32(4), mi.Float(reach), mi.Bool(True))
+        T, _ = transmittance_of_chain(
+            trace, ray, places.medium(trace, ray, mi.Bool(True)), key, mi.UInt32(4), mi.Float(reach), mi.Bool(True)
+        )
     length = (5 + 3 * 6) / dr.abs(ray.d.z) + reach
     assert np.array(T) == pytest.approx(np.exp(-0.25 * np.array(length)) * np.ones((3, 1)), rel=0.02)
 

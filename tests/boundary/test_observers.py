@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from pathreplay.adjoint.record import Layout, record_type, room_for
 from pathreplay.boundary.importance import EVENLY, VERTICES, Importance, Importances
 from pathreplay.boundary.observer import choose_vertex
 from pathreplay.integrators.camera_pass import Pass
@@ -44,6 +45,30 @@ def test_no_selection_changes_the_mean(shares: list[float]) -> None:
     assert np.abs(gap(means, plain).z).max() < Z_LIMIT
     largest = int(np.argmax(shares))
     assert counts[:, largest].mean() > 1.2 * evenly[:, largest].mean()
+
+
+def test_paths_end_where_null_boundaries_fill_the_record() -> None:
+    """Twelve shells around the camera and a wall: a path crosses more of them than its record holds."""
+    shells = {
+        f"shell {k}": {"type": "sphere", "radius": 1 + 0.1 * k, "bsdf": {"type": "null"}, "interior": fog}
+        for k, fog in enumerate([{"type": "homogeneous", "sigma_t": 1e-3}] * 24)
+    }
+    wall = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 9]).rotate([0, 1, 0], 180).scale(9),
+    }
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "wall": wall, **shells})
+    trace = mi.load_dict({"type": "pathreplay", "max_depth": 2})._trace_config(scene, scene.sensors()[0])
+    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(mi.Float(np.linspace(-0.1, 0.1, 64)), 0, 1))
+    room = room_for(trace)
+    assert room < len(shells)
+    with dr.suspend_grad():
+        key = key_of(dr.arange(mi.UInt32, 64), mi.UInt32(7))
+        layout = Layout.of(trace, True)
+        records = dr.alloc_local(record_type(layout), room)
+        shares = mi.Float([1.0] * VERTICES)
+        _, x = choose_vertex(trace, CounterSampler.of(key), ray, mi.Bool(False), shares, layout, records)
+    assert not (np.array(x.active) & (np.array(x.k) >= room)).any()
 
 
 def importances() -> Importances:

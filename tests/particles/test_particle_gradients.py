@@ -442,6 +442,11 @@ def foggy(light: str = "point", kind: str = "grey", center: tuple[float, float, 
     return scene
 
 
+def caustic_in_fog() -> dict:
+    """`milky` with a small black ball below the lens, in the caustic."""
+    return {**milky(), "blocker": round_mesh(80, 0.12, (-0.45, 0.5, 0.15), BLACK)}
+
+
 BETWEEN = (0.0, 1.9, -0.9)
 """A place between the box of fog and the camera."""
 in_fog: Callable[..., Mean] = partial(
@@ -457,6 +462,7 @@ FOG_EDGES = (
     in_fog("light moves", foggy, key="light.position", move=add([0.3, 0.5, 0.7])),
     in_fog("camera moves", foggy, key="sensor.to_world", move=translate(0.3, 0.5, 0.7)),
 )
+CAUSTIC = in_fog("blocker in the caustic", caustic_in_fog, key="blocker.vertex_positions", depth=4, spp=4096)
 
 
 def test_a_shadow_in_the_light_is_in_the_gradient() -> None:
@@ -475,6 +481,19 @@ def test_edges_that_light_meets_are_in_the_gradient(cell: Mean) -> None:
 @pytest.mark.parametrize("cell", FOG_EDGES, ids=lambda c: c.name)
 def test_edges_in_fog_are_in_the_gradient(cell: Mean) -> None:
     hold_both_modes(cell, cell.spp // 16)
+
+
+def test_an_occluder_before_fog_is_in_the_gradient() -> None:
+    (cell,) = (c for c in FOG_EDGES if c.name == "ball before the camera")
+    z, error = in_expectation(replace(cell, peer=PLUGIN, seeds=4, spp=512))  # no kernels of a peer
+    assert abs(z) < Z_LIMIT and error < RESOLUTION
+
+
+@pytest.mark.slow
+def test_edges_in_a_caustic_in_fog_are_in_the_gradient() -> None:
+    split = replace(CAUSTIC, options={"boundary": "all", "caustics": "particles"})
+    z, error = in_expectation(split, "pathreplay")
+    assert abs(z) < Z_LIMIT and error < RESOLUTION
 
 
 @pytest.mark.slow

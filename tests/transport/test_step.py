@@ -23,7 +23,7 @@ from pathreplay.transport.meet import meet
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
-from pathreplay.transport.step import Visit, choose_step, repeat_step
+from pathreplay.transport.step import choose_step, repeat_step
 from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples
 from pathreplay.transport.volume.passage import skip_null
 
@@ -73,7 +73,7 @@ def rays(spread: float = 0.9) -> mi.Ray3f:
     return mi.Ray3f(mi.Point3f(x, y, 0.5), dr.normalize(mi.Vector3f(0.1 * y, 0.2, -1)))
 
 
-def first_step(trace: TraceConfig, ctx: mi.BSDFContext | None = None) -> tuple[Arrival, VertexSamples, SampledStep]:
+def first_step(trace: TraceConfig) -> tuple[Arrival, VertexSamples, SampledStep]:
     """An arrival, the numbers, and the step that they choose."""
     on = mi.Bool(True)
     drawn = sampler()
@@ -81,7 +81,7 @@ def first_step(trace: TraceConfig, ctx: mi.BSDFContext | None = None) -> tuple[A
     if trace.media is not None:
         at.medium = mi.MediumPtr(next(filter(None, (shape.interior_medium() for shape in trace.scene.shapes()))))
     u = VertexSamples.draw(drawn)
-    return at, u, choose_step(trace, Visit(at, mi.Spectrum(1), on, on), u, drawn, ctx=ctx)
+    return at, u, choose_step(trace, at, mi.Spectrum(1), u, drawn, on, on)
 
 
 def replayed(trace: TraceConfig, at: Arrival, u: VertexSamples, chosen: SampledStep) -> VertexRecord:
@@ -120,35 +120,6 @@ def test_a_repeated_step_is_the_chosen_one(world: Any, attached: bool) -> None:
         assert (np.array(chosen.signature.shape)[event] == 0).all()
 
 
-def test_the_transport_mode_reaches_the_bsdf() -> None:
-    """Radiance is squeezed on the way into glass, by the square of the index; importance is not."""
-    trace = walk_of(scene(GLASS))
-    weights = {}
-    with dr.suspend_grad():
-        for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
-            ctx = mi.BSDFContext(mode)
-            at, u, chosen = first_step(trace, ctx)
-            again = repeat_step(trace, replayed(trace, at, u, chosen), False, mi.Bool(True), ctx)
-            through = np.array(chosen.ray_next.d.z) < 0
-            weights[mode] = np.array(chosen.w)[:, through]
-            assert np.allclose(np.array(again.w)[:, through], weights[mode], rtol=1e-4)
-    assert through.any()
-    squeezed = weights[mi.TransportMode.Radiance] / weights[mi.TransportMode.Importance]
-    assert np.allclose(squeezed, 1 / 1.5**2, rtol=1e-4)
-
-
-@pytest.mark.parametrize(("lobe", "down"), [(0, False), (1, True)])
-def test_a_lobe_can_be_asked_for(lobe: int, down: bool) -> None:
-    trace, ctx = walk_of(scene(GLASS)), mi.BSDFContext()
-    ctx.component = lobe
-    with dr.suspend_grad():
-        at, u, chosen = first_step(trace, ctx)
-        again = repeat_step(trace, replayed(trace, at, u, chosen), False, mi.Bool(True), ctx)
-    assert np.array_equal(np.array(chosen.ray_next.d.z) < 0, np.full(LANES, down))
-    assert (np.array(chosen.signature.lobe) == lobe).all()
-    assert np.allclose(again.w, chosen.w, rtol=1e-4)
-
-
 def test_signatures_tell_the_edge_of_a_shape() -> None:
     ball = {"type": "sphere", "radius": 0.4}
     trace = walk_of(scene({"type": "diffuse"}, ball=ball))
@@ -157,7 +128,7 @@ def test_signatures_tell_the_edge_of_a_shape() -> None:
         drawn, on = mi.load_dict({"type": "independent"}), mi.Bool(True)
         drawn.seed(0, 4)
         at = CameraStart(down, drawn, on).choose(trace, on)
-        step = choose_step(trace, Visit(at, mi.Spectrum(1), on, on), VertexSamples.draw(drawn), drawn)
+        step = choose_step(trace, at, mi.Spectrum(1), VertexSamples.draw(drawn), drawn, on, on)
     shape = np.array(step.signature.shape)
     assert shape[0] == shape[1] != shape[2]
     assert list(step.signature.met) == [True, True, True, False]

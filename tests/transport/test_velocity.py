@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 
 from pathreplay.integrators.scene_facts import facts_of
-from pathreplay.transport.velocity import BLEND, moved_direction
+from pathreplay.transport.scatter import is_seen_through
+from pathreplay.transport.velocity import BLEND, blend_length, blend_length_at, moved_direction
 
 Vector = tuple[float, float, float]
 UP: Vector = (0, 0, 1)
@@ -91,3 +93,31 @@ def test_the_weight_has_the_divergence_of_the_velocity(n_x: Vector, turn: Vector
             )
             divergence = sum(axes[i] @ (V[:, 1 + 2 * i] - V[:, 2 + 2 * i]) / (2 * ε) for i in (0, 1))
             assert δlog_J[0] == pytest.approx(divergence, rel=0.01, abs=0.05), (h, target)
+
+
+def instanced(bsdf: dict[str, object]) -> tuple[mi.Scene, mi.Ray3f]:
+    """An instance of a cube, and rays that hit it."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "cubes": {"type": "shapegroup", "cube": {"type": "cube", "bsdf": bsdf}},
+            "instance": {"type": "instance", "group": {"type": "ref", "id": "cubes"}},
+        }
+    )
+    return scene, mi.Ray3f(mi.Point3f(mi.Float([0.1, 0.5]), 0.2, 4), mi.Vector3f(0, 0, -1))
+
+
+def test_hits_inside_an_instance_have_its_blend_length() -> None:
+    """The shape of such a hit is a null pointer."""
+    scene, rays = instanced({"type": "diffuse"})
+    lengths = facts_of(scene).traits().tables.blend_lengths
+    found = blend_length_at(lengths, scene.ray_intersect_preliminary(rays))
+    instance = next(shape for shape in scene.shapes() if shape.class_name() == "Instance")
+    assert np.array(found) == pytest.approx([blend_length(instance)] * 2) and found[0] > 0
+
+
+def test_a_mask_inside_an_instance_is_seen_through() -> None:
+    scene, rays = instanced({"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}})
+    trace = mi.load_dict({"type": "pathreplay"})._trace_config(scene, None)
+    trace = replace(trace, may_slide=True)
+    assert dr.all(is_seen_through(trace, scene.ray_intersect_preliminary(rays), rays))

@@ -17,7 +17,7 @@ from pathreplay.adjoint.autodiff import backward
 from pathreplay.adjoint.primal import path_radiance
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.path import PathState, next_arrival
-from pathreplay.transport.step import Visit, choose_step
+from pathreplay.transport.step import choose_step
 from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, VertexSamples
 from pathreplay.transport.volume.media import interaction, majorant
 
@@ -83,8 +83,7 @@ def branch_term(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ra
         one = mi.Spectrum(1)
         flight = Flight(event=active, t=mi.Float(0), density=mi.Float(1), W=one, along=mi.Float(0), σ_s=one)
         u = VertexSamples.draw(sampler)
-        visit = Visit(at, one, branch.depth + 1 < trace.max_depth, active)
-        step = choose_step(onward, visit, u, sampler, flight)
+        step = choose_step(onward, at, one, u, sampler, branch.depth + 1 < trace.max_depth, active, flight)
         at_next = next_arrival(onward, at, step, step.active)
         L, _ = path_radiance(onward, sampler, PathState(at_next, one, None, branch.η, branch.depth + 1, step.active))
         L_s = step.e + step.w * L

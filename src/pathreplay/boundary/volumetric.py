@@ -31,7 +31,7 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport.meet import meet
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
-from pathreplay.transport.step import Visit, choose_step
+from pathreplay.transport.step import choose_step
 from pathreplay.transport.vertex import Flight, TraceConfig, VertexSamples
 from pathreplay.transport.volume.media import interaction
 from pathreplay.transport.volume.passage import skip_null, transmittance_up_to
@@ -165,7 +165,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
             event_flight = Flight.none(trace.media)
             event_flight.event, event_flight.t = event, dr.select(event, τ - travelled, 0)
             u = VertexSamples.draw(sampler)
-            step = choose_step(trace, Visit(path.at, path.β, mi.Bool(False), path.active), u, sampler, event_flight)
+            step = choose_step(trace, path.at, path.β, u, sampler, mi.Bool(False), path.active, event_flight)
             onward, v = path.advance(trace, u, step)
             records[count] = record(layout, v)
             at, k = dr.select(event, path.at, at), dr.select(event, count, k)

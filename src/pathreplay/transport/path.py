@@ -10,7 +10,7 @@ import mitsuba as mi
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.meet import meet
 from pathreplay.transport.start import Start, behind_emitters
-from pathreplay.transport.step import Visit, choose_step
+from pathreplay.transport.step import choose_step
 from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples, reciprocal
 from pathreplay.transport.volume.passage import skip_null
 
@@ -46,7 +46,7 @@ class PathState:
         """Draw the random numbers of this vertex, and sample its step from them."""
         u = VertexSamples.draw(sampler)
         β = self.β if self.β_alive is None else self.β_alive
-        return u, choose_step(trace, Visit(self.at, β, self.depth + 1 < trace.max_depth, self.active), u, sampler)
+        return u, choose_step(trace, self.at, β, u, sampler, self.depth + 1 < trace.max_depth, self.active)
 
     def leave(self) -> tuple[PathState, mi.Bool]:
         """Terminate paths whose ray leaves the scene.

@@ -62,10 +62,7 @@ def choose(
     lit: mi.Bool,
     go_on: mi.Bool,
 ) -> Sampled:
-    """Sample the continuation, and evaluate scattering from the direction ``d`` of the emitter sample. Detached.
-
-    ``ctx`` contains the transport mode and may restrict sampling to one component.
-    """
+    """Sample the continuation, and evaluate scattering from the direction ``d`` of the emitter sample. Detached."""
     at_surface = go_on & v.surface
     if v.inside is not None and trace.media.passes:
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)

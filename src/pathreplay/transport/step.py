@@ -6,8 +6,6 @@ differentiable. Loops, images and gradient accumulation belong to the callers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -28,35 +26,26 @@ from pathreplay.transport.vertex import (
 )
 
 
-@dataclass
-class Visit:
-    """The state of a path that arrives at a vertex."""
-
-    at: Arrival
-    β: mi.Spectrum  # throughput, on which the probability of a real collision depends
-    go_on: mi.Bool  # False at the last vertex that ``max_depth`` allows
-    active: mi.Bool
-
-
 def choose_step(
     trace: TraceConfig,
-    visit: Visit,
+    at: Arrival,
+    β: mi.Spectrum,
     u: VertexSamples,
     sampler: Sampler,
+    go_on: mi.Bool,
+    active: mi.Bool,
     flight: Flight | None = None,
-    ctx: mi.BSDFContext | None = None,
 ) -> SampledStep:
     """Sample a step. The random numbers ``u`` determine the emitter sample and the continuation.
 
-    With media, ``sampler`` provides the random numbers of the shadow ray and, unless ``flight`` is given, of the
-    flight. Null boundaries are returned as ``null`` steps, which do not count as vertices. ``ctx`` contains the
-    transport mode (default: radiance) and may restrict sampling on surfaces to one BSDF component.
+    At the last vertex that ``max_depth`` allows, ``go_on`` is False. With media, ``sampler`` provides the random
+    numbers of the shadow ray and, unless ``flight`` is given, of the flight, which depends on the throughput ``β``.
+    Null boundaries are returned as ``null`` steps, which do not count as vertices.
     """
-    at, go_on, active = visit.at, visit.go_on, visit.active
     if trace.to_sensor is not None:
-        return particle.choose_step(trace, at, visit.β, u, sampler, go_on, active, flight)
-    ctx = mi.BSDFContext() if ctx is None else ctx
-    v = arrive.choose(trace, at, sampler, visit.β, active, flight)
+        return particle.choose_step(trace, at, β, u, sampler, go_on, active, flight)
+    ctx = mi.BSDFContext()
+    v = arrive.choose(trace, at, sampler, β, active, flight)
     link = connect.choose(trace, v, u, sampler, go_on)
     to = scatter.choose(trace, v, at, u, ctx, link.light.d, link.lit, go_on)
     reached = link.reaches(to.pdf_light, False)
@@ -77,19 +66,16 @@ def choose_step(
     return SampledStep(e, w, ray_next, kept.pdf, signature, kept, to.eta, to.null, to.active, medium, lighting)
 
 
-def repeat_step(
-    trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool, ctx: mi.BSDFContext | None = None
-) -> Step:
+def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Step:
     """Evaluate a recorded step again, differentiable in emission, BSDFs, textures and media.
 
     If ``attached``, the step is also differentiable in the incident ray, its density and all geometry. The hit point
     then moves with ray and shape, and the continuation moves as described in `scatter`. Otherwise vertices and
-    directions are constant. Visibility and Russian roulette are never differentiated. ``ctx`` is the context that
-    `choose_step` used.
+    directions are constant. Visibility and Russian roulette are never differentiated.
     """
     if trace.to_sensor is not None:
         return particle.repeat_step(trace, again, attached, active)
-    ctx = mi.BSDFContext() if ctx is None else ctx
+    ctx = mi.BSDFContext()
     v = arrive.repeat(trace, again, attached, active)
     e = v.glow + connect.repeat(trace, v, again, ctx, attached)
     w, d, pdf = scatter.repeat(trace, v, again, ctx, attached)
