@@ -485,7 +485,7 @@ def test_edges_in_fog_are_in_the_gradient(cell: Mean) -> None:
 
 def test_an_occluder_before_fog_is_in_the_gradient() -> None:
     (cell,) = (c for c in FOG_EDGES if c.name == "ball before the camera")
-    z, error = in_expectation(replace(cell, peer=PLUGIN, seeds=4, spp=512))  # no kernels of a peer
+    z, error = in_expectation(replace(cell, peer=PLUGIN, seeds=4, spp=1024))  # no kernels of a peer
     assert abs(z) < Z_LIMIT and error < RESOLUTION
 
 

@@ -22,13 +22,6 @@ ROUNDING = 2.0**-22
 def meet(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.PreliminaryIntersection3f:
     """Intersect a ray with the scene, with the workaround for curve ends. Detached."""
     hit = trace.scene.ray_intersect_preliminary(ray, coherent=coherent, reorder=False, active=active)
-    return short_of_end(trace, ray, hit, active)
-
-
-def short_of_end(
-    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
-) -> mi.PreliminaryIntersection3f:
-    """Return the hit. A hit on a B-spline curve is moved away from the end of its segment."""
     if trace.traits.splines:
         kind = shape_met(trace, hit, ray, active).shape_type()
         on_spline = active & hit.is_valid() & (kind == int(mi.ShapeType.BSplineCurve))

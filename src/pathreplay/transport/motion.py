@@ -7,7 +7,7 @@ count only if objects of the traced scene have gradients, too.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 
 import drjit as dr
 import mitsuba as mi
@@ -126,7 +126,8 @@ def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
     records the weight of a lobe symbolically. It then checks whether the weight has gradients. Media count if a
     parameter of a medium has gradients. Nothing is evaluated.
     """
-    media = [node for node in nodes_of(trace.scene) if isinstance(node, mi.Medium)]
+    nodes = nodes_of(trace.scene)
+    media, bsdfs = ([node for node in nodes if isinstance(node, kind)] for kind in (mi.Medium, mi.BSDF))
     if any(map(may_have_gradients, set().union(media, *map(nodes_of, media)))):
         return True
     lobe, valid = at.hit.prim_index, at.hit.is_valid()  # arrays whose values Dr.Jit does not know while it traces
@@ -135,13 +136,8 @@ def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
     kept = SampledContinuation(si.to_world(si.wi), mi.Float(1), lobe == 0, mi.Bool(False), lobe, valid)
     u = VertexSamples(mi.Point2f(0.5), mi.Float(0.5), mi.Point2f(0.5), mi.Float(0.5))
     again = VertexRecord(at, u, kept, valid, at.hit, mi.Float(1), mi.Spectrum(1))
+    shapes = (node for node in nodes if isinstance(node, mi.Shape))
+    surfaces = set(bsdfs).union(shapes, *map(nodes_of, bsdfs))  # with the textures of the BSDFs
     with dr.resume_grad():
         weight = scatter.repeat(trace, v, again, mi.BSDFContext(), False)[0]
-        return dr.grad_enabled(weight) and any(map(may_have_gradients, _surface_nodes(trace.scene)))
-
-
-def _surface_nodes(scene: mi.Scene) -> Iterable[mi.Object]:
-    """Return the shapes and BSDFs of a scene, with the textures of the BSDFs."""
-    nodes = nodes_of(scene)
-    bsdfs = {node for node in nodes if isinstance(node, mi.BSDF)}
-    return bsdfs.union(*map(nodes_of, bsdfs), (node for node in nodes if isinstance(node, mi.Shape)))
+        return dr.grad_enabled(weight) and any(map(may_have_gradients, surfaces))
