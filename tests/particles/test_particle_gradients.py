@@ -462,7 +462,10 @@ FOG_EDGES = (
     in_fog("light moves", foggy, key="light.position", move=add([0.3, 0.5, 0.7])),
     in_fog("camera moves", foggy, key="sensor.to_world", move=translate(0.3, 0.5, 0.7)),
 )
-CAUSTIC = in_fog("blocker in the caustic", caustic_in_fog, key="blocker.vertex_positions", depth=4, spp=4096)
+CAUSTIC = in_fog(
+    "blocker in the caustic", caustic_in_fog, key="blocker.vertex_positions", depth=4, spp=1024,
+    reference="pathreplay", options={"boundary": "all", "caustics": "particles"},
+)  # fmt: skip
 
 
 def test_a_shadow_in_the_light_is_in_the_gradient() -> None:
@@ -491,8 +494,7 @@ def test_an_occluder_before_fog_is_in_the_gradient() -> None:
 
 @pytest.mark.slow
 def test_edges_in_a_caustic_in_fog_are_in_the_gradient() -> None:
-    split = replace(CAUSTIC, options={"boundary": "all", "caustics": "particles"})
-    z, error = in_expectation(split, "pathreplay")
+    z, error = in_expectation(CAUSTIC, "pathreplay")
     assert abs(z) < Z_LIMIT and error < RESOLUTION
 
 
