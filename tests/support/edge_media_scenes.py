@@ -7,11 +7,29 @@ ball: a camera says that it stands in it, and a wall stops its rays.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
 
-from edge_scenes import ASIDE, BACK, BLACK, CARD, OVERHEAD, T, cell, glow, lamp, paint, patterned, picture, shape, sky
+from edge_scenes import (
+    ASIDE,
+    BACK,
+    BLACK,
+    CARD,
+    OVERHEAD,
+    T,
+    by_a_side_wall,
+    cell,
+    glow,
+    lamp,
+    paint,
+    patterned,
+    picture,
+    plain,
+    shape,
+    sky,
+)
 from media_scenes import FORWARD, NULL, heterogeneous, homogeneous, smooth
 from truth import Case, Move, add, camera, rgb, translate
 
@@ -123,6 +141,17 @@ def mirror_in_fog() -> dict:
     return in_fog(thin(), mirror=shape(glass, {"type": "conductor"}), lamp=lamp(light, 3), wall=shape(BACK, WALL))
 
 
+def indirect_in_smoke(box: bool = False) -> dict:
+    """Light that reaches a wall by another, through smoke that does not scatter: around all, or in a box of its own."""
+    light = {"type": "point", "position": [0.6, 2.6, 0.5], "intensity": rgb(9, 8, 7)}
+    parts = by_a_side_wall(plain, lambda: paint(0.8, 0.7, 0.3), light)()
+    smoke = {"type": "homogeneous", "sigma_t": 0.2, "albedo": 0.0}
+    if box:
+        place = T().translate([1.2, 0.1, 0]).scale([0.7, 1.5, 0.9])
+        return {**parts, "smoke": shape(place, NULL, "cube", interior=smoke)}
+    return {**parts, "fog": smoke, "camera": {**parts["camera"], "medium": FOG}}
+
+
 def media_cell(name: str, make: Callable[[], dict], key: str, move: Move, depth: int = 3, **more: Any) -> Case:
     return cell(name, make, key, move, depth, **{"reference": "volpath", "spp": 128, **more})
 
@@ -143,5 +172,7 @@ CELLS = [
     media_cell("shadow_chance", lambda: shadow_in_fog(lambda: lamp(NEAR, 4), **BY_CHANCE)(), OBJECT, grow, 2),
     media_cell("by_ball", lamp_by_a_ball, "lamp.to_world", translate(-1, 0, 0), 2),
     media_cell("fog_mirror", mirror_in_fog, "mirror.to_world", translate(0, 0, 1)),
+    media_cell("indirect", indirect_in_smoke, OBJECT, translate(1, 0.3, 0.4), spp=256, seeds=24),
+    media_cell("indirect_box", partial(indirect_in_smoke, True), OBJECT, translate(1, 0.3, 0.4), spp=256, seeds=24),
 ]
 BY_NAME = {each.name: each for each in CELLS}

@@ -36,7 +36,7 @@ class ArcSegment(Arc):
     @property
     def hard(self) -> bool:
         """Whether hard shadows are probed."""
-        return self.observer.trace.traits.hard_lights and self.observer.trace.media is None
+        return self.observer.trace.traits.hard_lights
 
     def probe(self, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
         return self._probe(t, active, self.hard)
@@ -109,7 +109,7 @@ class ArcSegment(Arc):
         near_a, shadow = edges[0].t <= edges[1].t, None
         if self.hard:
             a, b = (self._probe(t, active, hard=False) for t in (bracket.a, bracket.b))
-            tests = [self._shadow_test(ray, first, active) for ray, first in zip(rays, firsts, strict=True)]
+            tests = [self._shadow_test(ray, hit, active) for ray, hit in zip(rays, edges, strict=True)]
             shadow = HardShadow.between(trace, tests[0], tests[1], active & ~a.differs(b))
             near_a = dr.select(shadow.exists, shadow.in_a, near_a)
         sides = zip(rays, firsts, edges, strict=True)
@@ -135,8 +135,9 @@ class ArcSegment(Arc):
         active = active & dr.any(common != 0)
         at_near, at_far = (observer.arrival(side.ray, side.hit, pdf) for side in (near, far))
         arrivals = off_contact(trace, at_near, at_far, active)
-        T, arrivals = observer.onward(arrivals, SHORT_OF * near.edge.t, self.key, active & through)
         L, depth, shadow = [], x.depth + 1, edge.crease.shadow
+        through = through if shadow is None else through | shadow.exists
+        T, arrivals = observer.onward(arrivals, SHORT_OF * near.edge.t, self.key, active & through)
         for arrival in arrivals:
             path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < trace.max_depth))
             L.append(path_radiance(trace, CounterSampler.stream(self.key, Stream.BEYOND_EDGE), path)[0])
