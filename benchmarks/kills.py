@@ -19,12 +19,15 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import safetensors.numpy
 import typer
 
+from pathreplay.inverse.loop.checkpoint import HISTORY
 from pathreplay.inverse.loop.checksums import SEAL
 from pathreplay.runs.run_folder import CHECKPOINT
 
@@ -135,14 +138,13 @@ def _moment(run: Path) -> str:
         return "before the first checkpoint"
     if (run / "report.html").is_file():
         return "with all written"
-    done = len(_history(run))
+    done = len(_history(safetensors.numpy.load_file(run / CHECKPOINT)))
     stages = [stage["iterations"] for stage in JOB["stages"]]
     return f"in stage {1 + (done >= stages[0])}" if done < sum(stages) else "while the report is made"
 
 
-def _history(run: Path) -> list[Any]:
-    with safetensors.safe_open(str(run / CHECKPOINT), framework="numpy") as file:
-        return json.loads((file.metadata() or {})["history"])
+def _history(tensors: Mapping[str, np.ndarray]) -> list[Any]:
+    return json.loads(tensors[HISTORY].tobytes())
 
 
 def outcome(run: Path) -> dict[str, Any]:
@@ -153,9 +155,9 @@ def outcome(run: Path) -> dict[str, Any]:
     files = [run / name for name in names] + sorted((run / "images").glob("*.exr"))
     return {
         **{str(path.relative_to(run)): path.read_bytes() for path in files},
-        **{f"checkpoint: {key}": value.tobytes() for key, value in tensors.items() if key != SEAL},
+        **{f"checkpoint: {key}": value.tobytes() for key, value in tensors.items() if key not in (HISTORY, SEAL)},
         "history": [{**line, "seconds": 0} for line in lines],
-        "checkpoint: history": [{**line, "seconds": 0} for line in _history(run)],
+        "checkpoint: history": [{**line, "seconds": 0} for line in _history(tensors)],
     }
 
 

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib import import_module
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.loop import checkpoint
+from pathreplay.inverse.optim.adaptive import State
+from pathreplay.runs.run_folder import CHECKPOINT
 from places import ROOT
 
 sys.path.insert(0, str(ROOT))  # the benchmarks run from the checkout and are not installed
 
-from benchmarks import drafts, pages, plots, records, runner, summaries, tables
+from benchmarks import drafts, kills, pages, plots, records, runner, summaries, tables
 from benchmarks.__main__ import TASKS, main
 from benchmarks.compare import Row, compare
 from benchmarks.measures.job import Job, Machine, Point, Record
@@ -131,6 +136,31 @@ def test_stages_are_compared_with_the_same_stage_of_the_rival() -> None:
         ("sweep, import", "time / prb, import", "worse"),
         ("sweep, first gradient", "time / prb, first gradient", "worse"),
     ]
+
+
+# ------------------------------ Runs that are killed ------------------------------
+
+
+def saved_run(folder: Path, seconds: float = 0.5, loss: float = 1.0, value: float = 0.25) -> Path:
+    """A run folder as far as it is compared, with the checkpoint that a run of one variable writes."""
+    values = {"wall": np.full(3, value, np.float32)}
+    run = checkpoint.Run(executor=Mock(), optimiser=Mock(state=lambda: State({"wall": 1}, {})), values=values)
+    run.history = [checkpoint.Entry(0, loss, seconds, {"wall": 1.0})]
+    (folder / "images").mkdir(parents=True)
+    (folder / CHECKPOINT).write_bytes(b"".join(checkpoint.save(run)()))
+    (folder / "history.jsonl").write_text(json.dumps(asdict(run.history[0])) + "\n")
+    for name in ("parameters.safetensors", "parameters.json", "views.json"):
+        (folder / name).write_bytes(b"the same")
+    return folder
+
+
+def test_runs_are_compared_without_their_seconds(tmp_path: Path) -> None:
+    whole, late = (kills.outcome(saved_run(tmp_path / f"{t}", seconds=t)) for t in (0.5, 2.0))
+    assert whole == late and whole["checkpoint: history"][0]["loss"] == 1.0
+    other = kills.outcome(saved_run(tmp_path / "loss", loss=2.0))
+    assert {key for key in whole if whole[key] != other[key]} == {"history", "checkpoint: history"}
+    other = kills.outcome(saved_run(tmp_path / "value", value=0.5))
+    assert {key for key in whole if whole[key] != other[key]} == {"checkpoint: value:wall"}
 
 
 # ------------------------------ Going on after a break ------------------------------
