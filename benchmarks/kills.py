@@ -93,7 +93,8 @@ def _job_in(folder: Path) -> None:
 def _undisturbed(folder: Path) -> tuple[dict[str, Any], float, float]:
     """Outcome of an undisturbed run, seconds until its folder exists, and total seconds."""
     _job_in(folder)
-    _finish(_start(folder, "job.json"))  # fill Dr.Jit's cache of compiled kernels
+    if trouble := _finish(_start(folder, "job.json")):  # this run fills Dr.Jit's cache of compiled kernels
+        raise SystemExit(f"the first run failed: {trouble}")
     shutil.rmtree(folder / "run")
     begin, process = time.perf_counter(), _start(folder, "job.json")
     while not (folder / "run").exists() and process.poll() is None:

@@ -79,7 +79,7 @@ def _free_port() -> int:
 
 def _node(what: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "ray.scripts.scripts", "start", *what, "--num-cpus=1", "--block"]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
 
 
 def _wait_for(host: str, port: int) -> None:
