@@ -12,7 +12,9 @@ import time
 from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import psutil
@@ -25,6 +27,7 @@ if sys.version_info < (3, 11):
 else:
     import tomllib
 
+from pathreplay.distributed import cluster
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.schema import AUTO
 from pathreplay.inverse.loop.loop import new_run, take_step
@@ -282,6 +285,20 @@ def test_a_cluster_without_a_token_or_at_no_address_is_refused(tmp_path: Path, m
     monkeypatch.setenv("HOME", str(tmp_path))
     status, _, err = ended(start(tmp_path, "job.json", "--quiet"))
     assert status == 2 and "no cluster at '127.0.0.1:1'" in err and err.startswith(ERROR) and err.count("\n") == 1
+
+
+def test_another_version_of_ray_is_told_with_both_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (
+        "Version mismatch: The cluster was started with:\n    Ray: 2.54.0\n    Python: 3.11.7\n"
+        "This process on node 127.0.0.1 was started with:\n    Ray: 2.55.1\n    Python: 3.12.1\n"
+    )
+    ray = SimpleNamespace(init=Mock(side_effect=RuntimeError(text)), exceptions=SimpleNamespace(RayError=OSError))
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    with pytest.raises(PathreplayError) as told:
+        cluster._connect(ray, "10.0.0.1:6379")
+    line = str(told.value)
+    assert all(version in line for version in ("2.54.0", "3.11.7", "2.55.1", "3.12.1")) and "\n" not in line
+    assert "same versions of Ray and Python" in line and "token" not in line
 
 
 @SLOW

@@ -207,6 +207,11 @@ def _connect(ray: ModuleType, address: str) -> None:
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
+        if "Version mismatch" in str(error):  # the text has the versions on its later lines
+            raise PathreplayError(
+                f"ray: the cluster at '{address}' has other versions ({str(error).strip()}); install the same versions "
+                "of Ray and Python there and here"
+            ) from None
         raise PathreplayError(
             f"ray: no cluster at '{address}' accepts this program ({_first_line(error)}); run 'ray start' there and on "
             "this machine, with the same token on both (see docs/scale.md)"
