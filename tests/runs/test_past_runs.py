@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import shutil
@@ -9,6 +10,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import PIL.Image
@@ -101,6 +103,15 @@ def test_a_comparison_shows_parameters_that_the_last_stage_freezes(tmp_path: Pat
     assert [parameter.key for parameter in page.parameters] == [TEXTURE]
 
 
+def test_a_gradient_norm_that_is_infinite_is_not_drawn(tmp_path: Path) -> None:
+    runs = pasts([a_run(tmp_path / "a"), a_run(tmp_path / "b")])
+    runs[0].history[1].gradient_norms[TEXTURE] = float("inf")
+    page = compare.page(runs)
+    (plot,) = (plot for plot in page.plots if plot.title == "gradient norm of")
+    assert plot.series[0].y == (1.0, None, 0.25)
+    assert document(page)
+
+
 def test_runs_of_one_name_are_told_apart(tmp_path: Path) -> None:
     folders = [a_run(tmp_path / one / "run") for one in ("x", "y")]
     assert [past.name for past in pasts(folders)] == [str(folder) for folder in folders]
@@ -185,6 +196,15 @@ def test_a_film_shows_target_and_run_through_time(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*part*"))
 
 
+def test_a_texture_of_one_row_fits_into_a_film(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "a")
+    for path in (run / FOLDER).glob("*-texture-*.webp"):
+        path.write_bytes(png((9, 9, 60), (256, 1), "webp"))
+    assert timelapse.film(run, tmp_path / "film.webp") == 3
+    with PIL.Image.open(tmp_path / "film.webp") as film:
+        assert film.width == 2 * 384 + 4 * timelapse.HEIGHT + 2 * 4
+
+
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="there is no ffmpeg here")
 def test_a_film_may_be_mp4(tmp_path: Path) -> None:
     timelapse.film(a_run(tmp_path / "a"), tmp_path / "film.mp4")
@@ -197,6 +217,7 @@ def test_films_that_cannot_be_made_are_told(tmp_path: Path, monkeypatch: pytest.
         ("film.gif", None, "neither .webp nor .mp4"),
         ("film.webp", "top", "no frames of view 'top'; name a view with frames: left, right"),
         ("none/film.webp", None, "cannot be written"),
+        ("a/run.json/film.webp", None, "cannot be written"),
     ):
         with pytest.raises(PathreplayError, match=words):
             timelapse.film(run, tmp_path / output, view)
@@ -207,6 +228,8 @@ def test_films_that_cannot_be_made_are_told(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(PathreplayError, match="no frames in previews"):
         timelapse.film(run, tmp_path / "film.webp")
     assert not list(tmp_path.glob("*film*"))
+    with pytest.raises(PathreplayError, match="is not a run folder"):
+        timelapse.film(tmp_path, tmp_path / "film.webp")
 
 
 def test_events_are_what_tensorboard_reads(tmp_path: Path) -> None:
@@ -224,21 +247,42 @@ def test_events_are_what_tensorboard_reads(tmp_path: Path) -> None:
         tensorboard.write_events(run, tmp_path / "events/a")
 
 
-def test_events_of_runs_of_one_name_have_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Writer:
-        def __init__(self, folder: str) -> None:
-            Path(folder).mkdir(parents=True)
+class Writer:
+    """Stands for TensorBoard's writer, which makes missing folders."""
 
-        def add_scalar(self, tag: str, value: float, step: int, wall_time: float) -> None:
-            pass
+    def __init__(self, folder: str) -> None:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        Path(folder, "events").touch()
 
-        def close(self) -> None:
-            pass
+    def add_scalar(self, tag: str, value: float, step: int, wall_time: float) -> None:
+        pass
 
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def tensorboard_here(monkeypatch: pytest.MonkeyPatch) -> None:
     module = ModuleType("tensorboard.summary")
     module.Writer = Writer
     monkeypatch.setitem(sys.modules, "tensorboard", ModuleType("tensorboard"))
     monkeypatch.setitem(sys.modules, "tensorboard.summary", module)
+
+
+@pytest.mark.usefixtures("tensorboard_here")
+def test_no_events_are_left_of_a_disk_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (run,) = pasts([a_run(tmp_path / "a")])
+    with monkeypatch.context() as patch:
+        patch.setattr(Writer, "close", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+        with pytest.raises(PathreplayError, match="No space left on the disk"):
+            tensorboard.write_events(run, tmp_path / "events/a")
+    assert not any((tmp_path / "events").iterdir())
+    assert tensorboard.write_events(run, tmp_path / "events/a") == 3
+    assert [path.name for path in (tmp_path / "events/a").iterdir()] == ["events"]
+
+
+@pytest.mark.usefixtures("tensorboard_here")
+def test_events_of_runs_of_one_name_have_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     runs = [str(a_run(Path(one))) for one in ("x/run", "y/run", "z")]
     told = CliRunner().invoke(app, ["tensorboard", *runs, "--output", "events"])

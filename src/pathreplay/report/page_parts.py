@@ -74,7 +74,7 @@ def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
 
     def plot(title: str, code: str, **lines: Iterable[float | None]) -> Plot:
         """Make a plot of ``lines`` over the iterations; a legend names the lines if there are several."""
-        series = (Series(name * (len(lines) > 1), x, tuple(_rounded(v) for v in y)) for name, y in lines.items())
+        series = (Series(name * (len(lines) > 1), x, tuple(rounded(v) for v in y)) for name, y in lines.items())
         return Plot(title, tuple(series), code=code)
 
     drawn = [plot("loss", "", loss=(entry.loss for entry in entries))]
@@ -102,7 +102,7 @@ def plots_note(history: Sequence[Entry]) -> str:
     return THINNED.format(len(history), taken[1] - taken[0]) if len(taken) < len(history) else ""
 
 
-def _rounded(value: float | None) -> float | None:
+def rounded(value: float | None) -> float | None:
     """Round to six digits, which suffice for a curve. Values that are not finite become None, and are not drawn."""
     return None if value is None or not np.isfinite(value) else float(f"{value:.6g}")
 

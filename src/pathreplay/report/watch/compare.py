@@ -15,7 +15,7 @@ import PIL.Image
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.platform.files import file_names
-from pathreplay.report.page_parts import uri
+from pathreplay.report.page_parts import rounded, uri
 from pathreplay.report.pages.page import Head, Page, Parameter, Picture, Plot, Row, Series, Table, View, thinned
 from pathreplay.report.report import MOST_PIXELS, MOST_VIEWS
 from pathreplay.report.watch.past import Past
@@ -121,7 +121,7 @@ def _plots(runs: list[Past]) -> tuple[Plot, ...]:
             taken = thinned(len(run.history))
             times = np.cumsum([entry.seconds for entry in run.history])
             x = tuple(float(f"{times[i]:.4g}") if seconds else float(i) for i in taken)
-            y = tuple(None if (v := value(run.history[i])) is None else float(f"{v:.6g}") for i in taken)
+            y = tuple(rounded(value(run.history[i])) for i in taken)
             series.append(Series(run.name, x, y))
         return Plot(title, tuple(series), code=code, along="second" if seconds else "iteration")
 

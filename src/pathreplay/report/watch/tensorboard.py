@@ -6,6 +6,7 @@ import itertools
 from pathlib import Path
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.report.watch.past import Past
 
 
@@ -26,8 +27,8 @@ def write_events(run: Past, folder: Path) -> int:
     began = (run.folder / "run.json").stat().st_mtime
     times = itertools.accumulate((entry.seconds for entry in history), initial=began)
     next(times)
-    try:
-        writer = Writer(str(folder))
+    with whole_folder(folder, "--output") as part:
+        writer = Writer(str(part))
         for entry, time in zip(history, times, strict=True):
             scalars = {"loss": entry.loss, "penalty": entry.penalty, "picture_error": entry.picture_error}
             scalars |= {f"error/{key}": value for key, value in entry.errors.items()}
@@ -36,6 +37,4 @@ def write_events(run: Past, folder: Path) -> int:
                 if value is not None:
                     writer.add_scalar(tag, value, entry.iteration, wall_time=time)
         writer.close()
-    except OSError as error:
-        raise PathreplayError(f"{folder} cannot be written ({error.strerror}); give another --output") from None
     return len(history)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,7 +14,9 @@ import PIL.ImageDraw
 import PIL.ImageFont
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.atomic_files import write_whole
 from pathreplay.report.live_page import FOLDER, frames
+from pathreplay.report.watch.past import pasts
 from pathreplay.report.watch.run_files import read_own
 
 # Height of the images, and of the line of text below the images, in pixels.
@@ -36,29 +39,16 @@ def film(run: Path, output: Path, view: str | None = None, seconds: float = 6.0)
         The number of frames.
 
     Raises:
-        PathreplayError: the run has no frames, the file cannot be written, its type is unknown, or MP4 is requested
-            without ffmpeg.
+        PathreplayError: the folder is not a run folder or has no frames, the file cannot be written, its type is
+            unknown, or MP4 is requested without ffmpeg.
     """
     if output.suffix.lower() not in KINDS:
         raise PathreplayError(f"--output {output} is neither .webp nor .mp4; give a name with one of these endings")
+    pasts([run])
     pictures = _pictures(run, view)
     pause = max(20, round(1000 * seconds / len(pictures)))
-    part = output.with_name(f".{output.stem}.part{output.suffix}")
-    try:
-        if output.suffix.lower() == ".webp":
-            durations = [pause] * (len(pictures) - 1) + [pause + 1500]
-            pictures[0].save(
-                part, "webp", save_all=True, append_images=pictures[1:], duration=durations, loop=0, quality=85
-            )
-        else:
-            _mp4(pictures, part, 1000 / pause)
-        part.replace(output)
-    except OSError as error:
-        raise PathreplayError(
-            f"{output} cannot be written ({error.strerror or error}); give another --output"
-        ) from None
-    finally:
-        part.unlink(missing_ok=True)
+    data = _webp(pictures, pause) if output.suffix.lower() == ".webp" else _mp4(pictures, 1000 / pause)
+    write_whole(output, data, "--output")
     return len(pictures)
 
 
@@ -83,8 +73,9 @@ def _pictures(run: Path, view: str | None) -> list[PIL.Image.Image]:
         now |= {what.split("-", 1)[1]: _opened(by_what[what][i]) for what in beside}
         sheets.append(now)
     # If a texture or volume was refined during the run, the resolution of its images varies. The sizes of the images in
-    # the last frame are used for all frames.
-    sizes = [(max(2, round(p.width * HEIGHT / p.height)), HEIGHT) for p in sheets[-1].values()]
+    # the last frame are used for all frames. Images of few rows are drawn narrower than they are: encoders have a
+    # maximum width.
+    sizes = [(min(max(2, round(p.width * HEIGHT / p.height)), 4 * HEIGHT), HEIGHT) for p in sheets[-1].values()]
     return [_side_by_side(now, sizes) for now in sheets]
 
 
@@ -113,21 +104,32 @@ def _opened(path: Path) -> PIL.Image.Image:
         raise PathreplayError(f"Image {path} is missing or damaged; start a new run") from None
 
 
-def _mp4(pictures: list[PIL.Image.Image], path: Path, rate: float) -> None:
+def _webp(pictures: list[PIL.Image.Image], pause: int) -> bytes:
+    """Encode frames that last ``pause`` milliseconds, the last one 1.5 seconds longer."""
+    buffer, durations = io.BytesIO(), [pause] * (len(pictures) - 1) + [pause + 1500]
+    pictures[0].save(buffer, "webp", save_all=True, append_images=pictures[1:], duration=durations, loop=0, quality=85)
+    return buffer.getvalue()
+
+
+def _mp4(pictures: list[PIL.Image.Image], rate: float) -> bytes:
+    """Encode frames as a video of ``rate`` frames per second."""
     tool = shutil.which("ffmpeg")
     if tool is None:
         raise PathreplayError(
             "MP4 needs ffmpeg, which is not installed; install it, or give an --output that ends in .webp"
         )
     width, height = pictures[0].size
-    command = [
-        tool, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
-        "-r", f"{rate:.4f}", "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path.absolute()),
-    ]  # fmt: skip
     data = b"".join(picture.tobytes() for picture in pictures)
-    done = subprocess.run(command, input=data, capture_output=True, check=False)
-    if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        raise PathreplayError(
-            f"ffmpeg failed ({said[-1] if said else done.returncode}); use an --output that ends in .webp"
-        )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "film.mp4")
+        command = [
+            tool, "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
+            "-r", f"{rate:.4f}", "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path),
+        ]  # fmt: skip
+        done = subprocess.run(command, input=data, capture_output=True, check=False)
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").strip().splitlines()
+            raise PathreplayError(
+                f"ffmpeg failed ({said[-1] if said else done.returncode}); use an --output that ends in .webp"
+            )
+        return path.read_bytes()
