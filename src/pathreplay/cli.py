@@ -12,6 +12,7 @@ import contextlib
 import errno
 import io
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -93,8 +94,9 @@ def doctor(
     if gpu:
         from pathreplay.testing.gpu import examine as examine_gpu
 
-        typer.echo(examine_gpu(variant, output, tell=typer.echo))
-        return
+        summary, wrong = examine_gpu(variant, output, tell=typer.echo)
+        typer.echo(summary)
+        raise typer.Exit(1 if wrong else 0)
     with interrupts.undisturbed():  # signals must not interrupt imports; see `optimize`
         from pathreplay.doctor import examine
 
@@ -179,7 +181,9 @@ def optimize(
     resume: Annotated[Path | None, typer.Option(metavar="RUN_FOLDER", help="Resume an unfinished run instead.")] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FOLDER", help="Run folder to create (default: runs/<config>)."),
+        typer.Option(
+            "--output", "-o", metavar="FOLDER", help="Run folder to create (default: the job's, else runs/<config>)."
+        ),
     ] = None,
     changes: Annotated[
         list[str] | None,
@@ -240,7 +244,8 @@ def from_photos(
         tell(note)
     typer.echo(f"job: {written.job}")
     if no_run:
-        typer.echo(f"run it with: pathreplay optimize {written.job} --output {output / 'run'}")
+        command = ["pathreplay", "optimize", str(written.job), "--output", str(output / "run")]
+        typer.echo(f"run it with: {shlex.join(command)}")
         return
     result = run_job(written.job, output=output / "run", progress=not quiet)
     typer.echo(result.describe())

@@ -37,7 +37,8 @@ def test_the_file_has_what_was_found_and_what_failed(tmp_path: Path, monkeypatch
     found = {name: Item(name, fact) for name, fact in facts.items()} | {"time: c": Item("time: c", {}, "died")}
     monkeypatch.setattr(gpu, "_in_process", lambda variant, name: found[name])
     told: list[str] = []
-    line = examine("llvm_ad_rgb", tmp_path / "gpu.json", tuple(found), told.append)
+    line, wrong = examine("llvm_ad_rgb", tmp_path / "gpu.json", tuple(found), told.append)
+    assert wrong == ["truth: b", "time: c"]
     assert line.endswith("3 items, 2 failed (truth: b; time: c)")
     assert told == ["time: a: 0.5000 s", "truth: b: fail (z = +9.0)", "time: c: died"]
     report = json.loads((tmp_path / "gpu.json").read_text())
@@ -45,10 +46,22 @@ def test_the_file_has_what_was_found_and_what_failed(tmp_path: Path, monkeypatch
     assert [item["name"] for item in report["items"]] == list(found) and report["items"][2]["error"] == "died"
 
 
+@pytest.mark.parametrize(("error", "status"), [("", 0), ("died", 1)])
+def test_the_command_says_by_its_status_whether_an_item_failed(
+    error: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gpu, "_in_process", lambda variant, name: Item(name, {"seconds": 0.5}, error))
+    command = ["pathreplay", "doctor", "--gpu", "--variant", "llvm_ad_rgb", "--output", str(tmp_path / "gpu.json")]
+    monkeypatch.setattr(sys, "argv", command)
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == status
+
+
 @pytest.mark.slow
 def test_items_run_in_processes_of_their_own(tmp_path: Path) -> None:
     names = ("truth: colour of a wall", "time: recorded, 128 x 128, depth 8", "time: nothing")
-    line = examine("llvm_ad_rgb", tmp_path / "gpu.json", names, lambda line: None)
+    line, _ = examine("llvm_ad_rgb", tmp_path / "gpu.json", names, lambda line: None)
     truth, timing, none = json.loads((tmp_path / "gpu.json").read_text())["items"]
     assert truth["facts"]["verdict"] == "pass" and abs(truth["facts"]["z"]) < 4
     assert 0 < timing["facts"]["fastest"] <= timing["facts"]["seconds"]

@@ -66,9 +66,12 @@ class Item:
     error: str = ""
 
 
-def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: Callable[[str], None] = print) -> str:
-    """Run all items, or those in ``names``, write the results to ``output``, and return a summary line.
+def examine(
+    variant: str | None, output: Path, names: Sequence[str] = (), tell: Callable[[str], None] = print
+) -> tuple[str, list[str]]:
+    """Run all items, or those in ``names``, and write the results to ``output``.
 
+    Returns a summary line, and the names of the items that failed.
     ``variant`` None means cuda_ad_rgb. Raises PathreplayError if the variant does not run on this machine, or the file
     cannot be written.
     """
@@ -95,7 +98,7 @@ def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: 
     }
     write_whole(output, json.dumps(report, indent=1).encode() + b"\n", "--output")
     wrong = [item.name for item in results if item.error or item.facts.get("verdict") == "fail"]
-    return f"{output}: {len(results)} items, {len(wrong)} failed" + (f" ({'; '.join(wrong)})" if wrong else "")
+    return f"{output}: {len(results)} items, {len(wrong)} failed" + (f" ({'; '.join(wrong)})" if wrong else ""), wrong
 
 
 def _summary(facts: Json) -> str:
