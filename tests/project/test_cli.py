@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -222,3 +224,15 @@ def test_output_to_a_full_disk_is_told() -> None:
         command[-1] = "nothing"
         ended = subprocess.run(command, stdout=subprocess.PIPE, stderr=full, env=environment, text=True, timeout=60)
     assert ended.returncode == 2
+
+
+def test_the_command_that_runs_a_written_job_can_be_pasted(
+    run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "my photos"
+    written = SimpleNamespace(job=folder / "job.toml", notes=())
+    monkeypatch.setattr("pathreplay.jobs.from_photos", lambda *_, **__: written)
+    status, out, _ = run("from-photos", str(tmp_path), "--output", str(folder), "--no-run")
+    words = shlex.split(out.splitlines()[-1].removeprefix("run it with: "))
+    assert status == 0
+    assert words == ["pathreplay", "optimize", str(folder / "job.toml"), "--output", str(folder / "run")]
