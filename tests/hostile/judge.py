@@ -104,9 +104,7 @@ def _of_the_files(action: Action, ended: Ended, before: State, after: State) -> 
         found.append(f"changed or left behind: {min(left)}")
     if parts := {path for path in changed if path.endswith(".part") and path in after and path not in before}:
         found.append(f"left half-written: {min(parts)}")
-    if ended.status == 2 and (
-        made := {f for f in allowed if f in after and f not in before and f not in action.writes}
-    ):
+    if ended.status == 2 and (made := allowed & (after.keys() - before.keys())):
         if not any(f"{folder}/checkpoint.safetensors" in after for folder in made):
             found.append(f"left behind: {min(made)}")
     return found

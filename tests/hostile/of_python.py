@@ -80,7 +80,9 @@ for _value in ("'6'", "float('nan')", "1.5", "10**12", "-2", "True"):
 for _value in ("'5'", "float('nan')", "1.5", "0"):
     _code(f"pathreplay: rr_depth = {_value}", f"mi.load_dict({{'type': 'pathreplay', 'rr_depth': {_value}}})")
 for _value in ("'low'", "float('nan')", "-1"):
-    _code(f"pathreplay: noise = {_value}", f"mi.load_dict({{'type': 'pathreplay', 'noise': {_value}}})")
+    _code(
+        f"pathreplay: jacobian_noise = {_value}", f"mi.load_dict({{'type': 'pathreplay', 'jacobian_noise': {_value}}})"
+    )
 for _plugin in OPTIONS:
     for _variant in ("scalar_rgb", "scalar_spectral"):
         _code(f"{_plugin} in {_variant}", f"mi.load_dict({{'type': {_plugin!r}}})", variant=_variant)

@@ -168,18 +168,17 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
     **_of("capture", _CAPTURE, masks=["photos/masks"], width=[4], test_every=[2], medium=["fog"], near_clip=[0.01]),
     **_of("response", kind=["gamma", "curve"], segments=[4], fix_exponent=[True], learning_rate=[0.1]),
     **_of("parameters.texture", lower=[0.0], upper=[1.0], learning_rate=[0.1]),
-    **_of("parameters.texture", initial=[0.3, {"image": "texture.png", "fit": "crop", "raw": True}]),
+    "parameters.initial": [
+        {"parameters.texture.initial": 0.3},
+        {"parameters.texture.initial": {"image": "texture.png", "fit": "crop", "raw": True}},
+        {**_POSE, "parameters.pose.initial": {"translation": [0.1, 0, 0]}},
+    ],
     **_of("parameters.texture", total_variation=[0.1], l2_to_initial=[0.1], regularizer=["own:penalty"]),
     **_of("parameters.texture", parameterization=["softplus", "log"], pyramid=[True]),
     **_of("parameters.texture", {"parameters.texture.refine_at": [1]}, resolutions=[[2, 4]]),
     **_of("parameters.texture", {"parameters.texture.resolutions": [2, 4]}, refine_at=[[1]]),
     **_of("parameters.mesh", _MESH, large_steps_lambda=[5.0], laplacian_weight=[0.1]),
-    **_of(
-        "parameters.pose",
-        _POSE,
-        pose=["rigid", "translation"],
-        start=[{"translation": [0.1, 0, 0]}],
-    ),
+    **_of("parameters.pose", _POSE, pose=["rigid", "translation"]),
     **_of("parameters.pose", _POSE, pivot=[[0.0, 0, 0]], error_scale=[1.0], rotation_learning_rate=[1.0]),
     "parameters.key": [
         {"parameters.texture.key": TEXTURE},
@@ -261,11 +260,8 @@ def case_of(row: Row, number: int) -> Case:
         room.job(job_of(row))
         return Action(argv=OPTIMIZE, writes=("out", "out/deep") if "output" in row else ())
 
-    return Case(0, number, Recipe("pairs", " + ".join(f"{key} {_last(row[key], key)}" for key in row), spoil))
-
-
-def _last(setting: Mapping[str, Any], key: str) -> str:
-    return json.dumps(list(setting.values())[-1])
+    name = " + ".join(f"{key} {json.dumps(list(setting.values())[-1])}" for key, setting in row.items())
+    return Case(0, number, Recipe("pairs", name, spoil))
 
 
 def refusal(row: Row) -> str:
