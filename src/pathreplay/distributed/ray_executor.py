@@ -340,7 +340,7 @@ def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Te
         setup = ray.put(WorkerInit(config, base.resolve(), targets, mi.variant(), threads))
         kind = ray.remote(**_needs(threads), max_restarts=config.ray.max_restarts, max_task_retries=-1)(RayActor)
         actors = {number: kind.remote() for number in range(count)}
-        where = "this machine" if cluster.own else f"a cluster of {len(ray.nodes())} nodes"
+        where = "this machine" if cluster.own else f"a cluster of {sum(node['Alive'] for node in ray.nodes())} nodes"
         plural = "actor" if count == 1 else "actors"
         tell(f"ray: {count} {plural} with {threads} {'thread' if threads == 1 else 'threads'} each on {where}")
         pool = WorkerPool(cluster, actors, setup, config.ray.max_task_retries, tell, status)
