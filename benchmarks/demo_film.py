@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pathreplay import optimize
+from pathreplay.platform.threads import processor_name, usable_cores
 from pathreplay.report.watch.timelapse import film
 
 from .drafts import ROOT
-from .measures.worker import processor_name
 
 JOB = ROOT / "examples" / "cornell-photo" / "config.toml"
 #: More time for frames than by default, and as many as keep the film small.
@@ -40,9 +40,8 @@ def make(images: Path, page: Path, define: Sequence[str] = ()) -> str:
         result = optimize(JOB, output=Path(folder, "run"), define=(*FRAMES, *define))
         film(result.folder, images / "demo.webp")
     seconds = sum(entry.seconds for entry in result.history)
-    processors = len(os.sched_getaffinity(0))
     caption = (
-        f"*{result.iterations} iterations in {seconds:.0f} seconds, on {processors} processors of a machine with "
+        f"*{result.iterations} iterations in {seconds:.0f} seconds, on {usable_cores()} processors of a machine with "
         f"{processor_name()} (`python -m benchmarks.demo_film`).*"
     )
     page.write_text(CAPTION.sub(rf"\g<1>{caption}\n\g<2>", page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -20,9 +20,9 @@ import psutil
 from pydantic import TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.threads import processor_name, usable_cores
 
 from ..drafts import ROOT
-from ..measures.worker import processor_name
 from ..records import commit
 from .entries import Entry
 
@@ -111,12 +111,11 @@ def run(entry: Entry, runs: Path, checkouts: Sequence[Path] = ()) -> Run:
         _call([*job, "--output", str(folder)], DRJIT_CACHE_DIR=cache)
     seconds, others = time.perf_counter() - listener.begin, listener.others()
     history = history_of(folder)
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     found = Run(
         date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         commit=commit(),
         processor=processor_name(),
-        processors=usable,
+        processors=usable_cores(),
         system=f"{platform.system()} {platform.machine()}",
         iterations=len(history),
         seconds=round(sum(line["seconds"] for line in history), 2),

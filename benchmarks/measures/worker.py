@@ -21,6 +21,7 @@ import numpy as np
 
 from pathreplay import __version__, baselines
 from pathreplay.platform import backend
+from pathreplay.platform.threads import processor_name, usable_cores
 
 from .job import Job, Kind, Machine, Measure
 
@@ -66,21 +67,12 @@ def _say(event: str, **facts: Any) -> None:
     print(json.dumps({"event": event} | facts), file=_PIPE, flush=True)
 
 
-def processor_name() -> str:
-    """Return the name of the processor, if the system provides it, otherwise the machine type."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
 def _machine(variant: str) -> Machine:
     import drjit as dr
 
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return Machine(
         processor=processor_name(),
-        processors=usable,
+        processors=usable_cores(),
         threads=dr.thread_count(),
         system=f"{platform.system()} {platform.machine()}",
         python=platform.python_version(),

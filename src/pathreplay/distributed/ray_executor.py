@@ -7,7 +7,6 @@ shard and the learned state, and evaluations are summed in shard order.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ from pathreplay.inverse.dataset.targets import Targets
 from pathreplay.inverse.objective.evaluate import Evaluation, Shard
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.inverse.problem.problem import Problem
+from pathreplay.platform.threads import usable_cores
 from pathreplay.scenes.descriptions import one_line
 
 THREADS = 4
@@ -331,7 +331,7 @@ def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Te
     if config.executor != "ray":
         yield None
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     threads = config.ray.threads or (1 if config.deterministic else max(1, min(THREADS, cores // 2)))
     with connected(config.ray, max(cores, threads * (config.ray.actors or 1))) as cluster:
         ray = cluster.ray

@@ -21,7 +21,7 @@ from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.inverse.problem.problem import Problem, build_problem
 from pathreplay.platform import backend, memory
-from pathreplay.platform.threads import one_thread
+from pathreplay.platform.threads import one_thread, processor_name
 from pathreplay.scenes.descriptions import errors_as
 
 
@@ -85,7 +85,7 @@ class RayActor:
         self.problem = build_problem(setup.config, setup.base, setup.targets)
         self.config = self.problem.config
         self.log = _capture_log()
-        machine = f"{_processor()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"
+        machine = f"{processor_name()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"
         return Ready(platform.node(), os.getpid(), versions(), machine)
 
     def evaluate(self, baseline: bool, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Answer] | None:
@@ -140,12 +140,3 @@ def _capture_log() -> Log:
     logger.clear_appenders()
     logger.add_appender(buffer)
     return buffer
-
-
-def _processor() -> str:
-    """Return the name of the processor if the system reports it, otherwise the machine type."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())

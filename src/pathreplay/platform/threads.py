@@ -1,14 +1,32 @@
-"""Changes the size of Dr.Jit's thread pool temporarily.
+"""Reports the processor, and changes the size of Dr.Jit's thread pool temporarily.
 
 Mitsuba needs at least two threads to read files. Sums are reproducible only with a single thread.
 """
 
 from __future__ import annotations
 
+import os
+import platform
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 import drjit as dr
+
+
+def usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def processor_name() -> str:
+    """Return the name of the processor if the system reports it, otherwise the machine type."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def spare_thread() -> AbstractContextManager[None]:
