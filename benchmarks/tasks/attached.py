@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from ..measures.job import Job, Point, Record
+from ..measures.job import Job, Record
 from ..tables import groups, markdown, method_cell, time_cells
+from .depth import memory_or_error
 
 TITLE = "attached"
 TAKES = (12, 75)
@@ -60,13 +61,7 @@ def table(record: Record) -> str:
     ]
     times = markdown(["gradient of", "depth", "method", "seconds (median)", "time / prb"], rows)
     memory = [
-        [str(depth), str(paths), *(_memory(methods.get(m)) for m in ("prb", "sweep"))]
+        [str(depth), str(paths), *(memory_or_error(methods.get(m)) for m in ("prb", "sweep"))]
         for (_, _, depth, paths), methods in groups(p for p in record.points if p.scene == "closed-box").items()
     ]
     return times + "\n\n" + markdown(["depth", "paths", "prb, MiB", "sweep, MiB"], memory)
-
-
-def _memory(point: Point | None) -> str:
-    if point is None or point.peak_mib is None:
-        return "" if point is None else point.error or ""
-    return f"{point.peak_mib:.0f}"

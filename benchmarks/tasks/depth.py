@@ -128,6 +128,11 @@ def memory_cell(point: Point | None) -> str:
     return "" if point is None or point.peak_mib is None else f"{point.peak_mib:.0f}"
 
 
+def memory_or_error(point: Point | None) -> str:
+    """Return the error message of a method that raised, otherwise the peak memory of the process in MiB."""
+    return point.error if point is not None and point.error else memory_cell(point)
+
+
 def alive(record: Record, method: str) -> list[Point]:
     """Return the points of a method without error, by increasing depth."""
     return [point for point in record.points if point.method == method and not point.error]

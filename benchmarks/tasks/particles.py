@@ -14,7 +14,7 @@ from ..measures.job import Curve, Job, Point, Record
 from ..measures.methods import parts
 from ..scenes.caustics import CAUSTIC_ROOM, FLOOR, HEIGHTS, LAMP, LIT_ROOM
 from ..tables import groups, markdown, pooled
-from .depth import fastest, memory_cell, seconds_cell
+from .depth import fastest, memory_or_error, seconds_cell
 
 TITLE = "particles"
 TAKES = (60, 3700)
@@ -121,15 +121,11 @@ def _memory(points: Iterable[Point]) -> str:
     """Format peak memory by the number of light paths and method, and its growth."""
     cells = {(point.paths, point.method): point for point in points}
     methods, sizes = (list(dict.fromkeys(values)) for values in zip(*((m, n) for n, m in cells), strict=True))
-    rows = [[f"{n:,}", *(_memory_cell(cells.get((n, method))) for method in methods)] for n in sorted(sizes)]
+    rows = [[f"{n:,}", *(memory_or_error(cells.get((n, method))) for method in methods)] for n in sorted(sizes)]
     return markdown(
         ["light paths: MiB", *methods],
         [*rows, ["last / first", *(_growth(cells[n, method] for n in sorted(sizes)) for method in methods)]],
     )
-
-
-def _memory_cell(point: Point | None) -> str:
-    return point.error if point is not None and point.error else memory_cell(point)
 
 
 def _growth(points: Iterable[Point]) -> str:

@@ -30,7 +30,7 @@ from benchmarks.measures.methods import DIFFERENCE
 from benchmarks.measures.replay_error import SWEEP
 from benchmarks.measures.worker import MEASURES, told
 from benchmarks.schedule import Costs, Trouble, built, simulated
-from benchmarks.tasks import depth, edges, iteration, media, noise, scale, surface, truth
+from benchmarks.tasks import attached, depth, edges, iteration, media, noise, scale, surface, truth
 
 MACHINE = Machine("a processor", 2, 2, "Linux", "3.11", "3.9.1", "1.5.0", "0.1.0", "23.1.4", "llvm_ad_rgb")
 ROUNDS = 12
@@ -136,6 +136,13 @@ def test_stages_are_compared_with_the_same_stage_of_the_rival() -> None:
         ("sweep, import", "time / prb, import", "worse"),
         ("sweep, first gradient", "time / prb, first gradient", "worse"),
     ]
+
+
+def test_a_method_that_raised_has_no_memory_in_the_table() -> None:
+    more = {"scene": "closed-box", "parameters": (attached.BALL,), "peak_mib": 100.0}
+    raised = point("sweep", **more, error="raises: nothing")
+    table = attached.table(record(point("prb", **more), raised, task="attached"))
+    assert table.splitlines()[-1].split("|")[3:5] == [" 100 ", " raises: nothing "]
 
 
 # ------------------------------ Runs that are killed ------------------------------
