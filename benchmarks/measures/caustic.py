@@ -44,9 +44,6 @@ class Caustic(Measure):
         ]
         return time.process_time() - start, np.array([chosen(self.curves[method]).errors[-1]])
 
-    def forget(self) -> None:
-        """Nothing: what the search has found is kept."""
-
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """All curves; the curves of the search come first."""
         return {name: {"curves": [asdict(curve) for curve in self.curves[name]]} for name in kept}

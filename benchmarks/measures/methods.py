@@ -15,7 +15,6 @@ METHODS: dict[str, dict[str, object]] = {
     "sweep": {"type": "pathreplay", "adjoint": "recorded", "sampling": "scene", "boundary": "none"},
     "replay": {"type": "pathreplay", "adjoint": "replay", "sampling": "scene", "boundary": "none"},
     "boundary and interior": {"type": "pathreplay", "boundary": "all"},
-    "primary": {"type": "pathreplay", "boundary": "primary", "sampling": "scene"},
     "all boundaries": {"type": "pathreplay", "boundary": "all", "sampling": "scene"},
     "prb_projective": {"type": "prb_projective"},
     "edge list": {"type": "prb_projective", "sppc": 0, "sppi": 0},

@@ -51,9 +51,6 @@ class Quality(Measure):
         )
         return time.process_time() - start, np.array([best(self.curves[method], MIDDLE).errors[-1]])
 
-    def forget(self) -> None:
-        """Nothing: what the search has found is kept."""
-
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """All curves; the curves of the search come first."""
         return {name: {"curves": [asdict(curve) for curve in self.curves[name]]} for name in kept}

@@ -27,12 +27,14 @@ def _mesh(name: str, positions: np.ndarray, faces: np.ndarray, bsdf: SceneDict, 
     return mesh
 
 
-def grid(x: np.ndarray, y: np.ndarray, z: np.ndarray, bsdf: SceneDict) -> mi.Mesh:
-    """Create a sheet of (rows, columns) vertices with shading normals towards positive z."""
+def grid(x: np.ndarray, y: np.ndarray, z: np.ndarray, bsdf: SceneDict, up: bool = True) -> mi.Mesh:
+    """Create a sheet of (rows, columns) vertices with shading normals towards positive z (``up``) or negative z."""
     i = np.arange(z.size).reshape(z.shape)
     a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel()
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
-    return _mesh("grid", np.stack([x, y, z], axis=-1).reshape(-1, 3), faces, bsdf, smooth=True)
+    return _mesh(
+        "grid", np.stack([x, y, z], axis=-1).reshape(-1, 3), faces if up else faces[:, ::-1], bsdf, smooth=True
+    )
 
 
 def rim(half_width: float, low: float, high: float, bsdf: SceneDict) -> mi.Mesh:

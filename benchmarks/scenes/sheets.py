@@ -8,6 +8,7 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
+from .caustics import grid
 from .parts import SceneDict, sensor
 
 UP = (0, 0.1, 1)
@@ -19,18 +20,7 @@ ROUGH_METAL: SceneDict = {"type": "roughconductor", "alpha": 0.2}
 def sheet(z: float, bend: float, half_width: float, up: bool, bsdf: SceneDict, n: int = 9) -> mi.Mesh:
     """A bent sheet of n x n vertices with shading normals, about the plane at height z."""
     y, x = np.mgrid[-1 : 1 : n * 1j, -1 : 1 : n * 1j] * half_width
-    positions = np.stack([x, y, z + bend * np.sin(1.3 * x + 0.3) * np.cos(1.1 * y)], axis=-1)
-    i = np.arange(n * n).reshape(n, n)
-    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel()
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
-    props = mi.Properties()
-    props["mesh_bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh("sheet", n * n, len(faces), has_vertex_normals=True, props=props)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = positions.astype(np.float32).ravel()
-    params["faces"] = (faces if up else faces[:, ::-1]).astype(np.uint32).ravel()
-    params.update()
-    return mesh
+    return grid(x, y, z + bend * np.sin(1.3 * x + 0.3) * np.cos(1.1 * y), bsdf, up)
 
 
 def smooth_environment(height: int = 32) -> SceneDict:
