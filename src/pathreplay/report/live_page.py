@@ -91,14 +91,11 @@ class Previews:
                 self.stop.by = BUTTON
             self._stepped(event.entry.iteration + 1, event.entry.seconds)
         elif isinstance(event, Stopped):
-            self._remove_stop_file()
+            self.folder.discard([STOP])
             by, took = f" by {self.stop.by}" if self.stop.by else "", time.perf_counter() - self._began
             self._log.append(f"ended after {event.done} iterations{by}")
             self._log.append(f"previews took {self.pictures.spent:.1f} of {took:.1f} s")
             self._write({})
-
-    def _remove_stop_file(self) -> None:
-        self.folder.discard([STOP])
 
     def finished(self, after: Mapping[str, Image]) -> dict[str, tuple[Still, ...]]:
         """Add a last frame with the result to each time-lapse film, and return the frames for the report, by subject.
@@ -193,7 +190,7 @@ class Previews:
         self._remove_frames(lambda iteration: iteration > self._resumed)
         self._kept = sorted({0, *(iteration for iteration, _, _ in frames(self.folder.path))})
         if self._stale:
-            self._remove_stop_file()
+            self.folder.discard([STOP])
         if self._resumed:
             self._write(self._begun())
 

@@ -25,7 +25,6 @@ from pathreplay.types import Json
 
 # Factor of difference images, which would otherwise be black after convergence.
 DIFFERENCE_GAIN = 4.0
-_KINDS = "target", "start", "result", "difference"
 
 
 @dataclass(frozen=True)
@@ -80,22 +79,25 @@ class ViewPictures:
 
         A difference is `DIFFERENCE_GAIN` times (result - target); positive values are red, and negative values blue.
         """
-        return (*_KINDS, *(() if self.baseline is None else ("baseline", "baseline-difference")))
+        return (
+            "target",
+            "start",
+            "result",
+            "difference",
+            *(() if self.baseline is None else ("baseline", "baseline-difference")),
+        )
 
     def picture(self, kind: str) -> Image:
         if kind in ("difference", "baseline-difference"):
             image = self.result if kind == "difference" else self.baseline
             assert image is not None
-            return self._difference(image)
+            gap = difference(image, self.target) * DIFFERENCE_GAIN
+            return gap if self.weight is None else gap * (self.weight > 0)
         return getattr(self, kind)
 
     def pictures(self) -> dict[str, Image]:
         """Return all images to show, by kind."""
         return {kind: self.picture(kind) for kind in self.kinds()}
-
-    def _difference(self, image: Image) -> Image:
-        gap = difference(image, self.target) * DIFFERENCE_GAIN
-        return gap if self.weight is None else gap * (self.weight > 0)
 
 
 @dataclass(frozen=True)

@@ -207,8 +207,7 @@ class Handler(BaseHTTPRequestHandler):
         for name, value in SAFE.items():
             self.send_header(name, value)
         self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(data)
+        self.wfile.write(data)
 
     def log_message(self, format: str, *arguments: object) -> None:
         """Log nothing, so that the address stays visible in the terminal."""
