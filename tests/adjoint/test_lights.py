@@ -9,13 +9,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from driven import BALL, FLOOR, LAMP, SEED, SIZE, SPP, attached, close, driven, ours, rgb, world
+from driven import BALL, FLOOR, LAMP, SEED, SIZE, SPP, attached, close, driven, ours, world
 from pathreplay.adjoint import emission_only as module
 from pathreplay.adjoint.emission_only import emission_only, only_emission_varies
 from pathreplay.adjoint.sweep import sweep
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.lifetimes import careful
-from truth import camera
+from truth import camera, rgb
 
 SKY = "sky.radiance.value"
 PAINT = {"type": "diffuse", "reflectance": rgb(0.5, 0.4, 0.3)}

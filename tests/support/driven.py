@@ -15,16 +15,13 @@ from pathreplay.adjoint.autodiff import NonFiniteCounter
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.lifetimes import careful
 from pathreplay.scenes.parameters import get_array
+from truth import rgb
 
 SIZE, SPP, SEED = 8, 16, 3
 
 
 #: Two sums of the same numbers in 32 bits, added up in another order.
 ROUNDING = 1e-5
-
-
-def rgb(*value: float) -> dict[str, Any]:
-    return {"type": "rgb", "value": list(value)}
 
 
 def world(bsdf: dict[str, Any] | None = None, lights: dict[str, Any] | None = None, **more: Any) -> mi.Scene:
