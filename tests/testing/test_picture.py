@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -42,6 +43,22 @@ def test_rows_are_drawn_in_every_format(tmp_path: Path) -> None:
     assert png.startswith(b"\x89PNG") and pdf.startswith(b"%PDF") and b"finite differences" in svg
     black = [("nothing", "pathreplay", np.zeros((4, 5, 3)), np.zeros((4, 5, 3)))]
     assert derivatives_figure(black, "png").startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"integrator": "prbvolpath"}, f"'prbvolpath' cannot differentiate '{FLOOR}' in forward mode: "),
+        ({"sensor": 9}, "Sensor 9 does not exist"),
+        ({"seeds": 0}, "seeds is 0; give at least 1"),
+        ({"seeds": 2.5}, "seeds is 2.5; give a whole number"),
+        ({"fd_spp": 0}, "fd_spp is 0; give at least 1 sample per pixel"),
+    ],
+)
+def test_unusable_arguments_are_refused_in_one_line(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(PathreplayError, match=message) as error:
+        derivative_images(world(), FLOOR, **{"seeds": 1, "spp": 1, **options})
+    assert "\n" not in str(error.value)
 
 
 def test_other_formats_are_refused_before_anything_is_computed() -> None:

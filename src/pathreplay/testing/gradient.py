@@ -127,8 +127,14 @@ def check_gradient(  # noqa: PLR0913 (most are keyword-only)
             differentiate this parameter.
     """
     fd_spp = spp if fd_spp is None else fd_spp
-    _require_types(key, loss, sensor=sensor, seeds=seeds, spp=spp, fd_spp=fd_spp, seed=seed)
-    _require_arguments(scene, sensor, seeds, spp, fd_spp, seed, mode)
+    require_types(key, sensor=sensor, seeds=seeds, spp=spp, fd_spp=fd_spp, seed=seed)
+    if loss is not None and not callable(loss):
+        raise PathreplayError(f"loss is {shown(loss)}; give a function from the image to a number, or leave it out")
+    require_arguments(scene, sensor, seeds, spp, fd_spp, seed)
+    if seeds < 2:
+        raise PathreplayError(f"seeds is {seeds}; a standard error needs at least 2; use 8 or more")
+    if mode not in ("backward", "forward"):
+        raise PathreplayError(f"mode is '{mode}'; choose 'backward' or 'forward'")
     params = traversed(scene)
     tested = integrator_under_test(integrator, scene, max_depth)
     line = line_of(params, key, tested, step, direction, seed)
@@ -216,19 +222,19 @@ def line_of(
     return choose_line(key, value.astype(np.float64), direction, step, seed, far=far, spectra=spectra)
 
 
-def _require_types(key: object, loss: object, **numbers: object) -> None:
+def require_types(key: object, **numbers: object) -> None:
+    """Raise PathreplayError unless ``key`` is a string and all ``numbers`` are whole numbers."""
     if not isinstance(key, str):
         raise PathreplayError(
             f"key is {shown(key)}; give the name of one parameter, for example 'wall.reflectance.data'"
         )
-    if loss is not None and not callable(loss):
-        raise PathreplayError(f"loss is {shown(loss)}; give a function from the image to a number, or leave it out")
     for name, number in numbers.items():
         if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
             raise PathreplayError(f"{name} is {shown(number)}; give a whole number")
 
 
-def _require_arguments(scene: object, sensor: int, seeds: int, spp: int, fd_spp: int, seed: int, mode: str) -> None:
+def require_arguments(scene: object, sensor: int, seeds: int, spp: int, fd_spp: int, seed: int) -> None:
+    """Raise PathreplayError for an unsuitable variant, scene or film, and for numbers out of range."""
     if mi.variant() is None or not dr.is_diff_v(mi.Float):
         raise PathreplayError(
             f"Variant '{mi.variant()}' has no derivatives; call mi.set_variant('llvm_ad_rgb') before loading the scene"
@@ -245,8 +251,8 @@ def _require_arguments(scene: object, sensor: int, seeds: int, spp: int, fd_spp:
         raise PathreplayError(f"Sensor {sensor} does not exist; the scene has {len(scene.sensors())}, counted from 0")
     if seeds > _MOST_SEEDS:
         raise PathreplayError(f"seeds is {shown(seeds)}; give at most {_MOST_SEEDS}, and more samples instead")
-    if seeds < 2:
-        raise PathreplayError(f"seeds is {seeds}; a standard error needs at least 2; use 8 or more")
+    if seeds < 1:
+        raise PathreplayError(f"seeds is {seeds}; give at least 1")
     counts = {"spp": spp, "fd_spp": fd_spp}
     for name, count in counts.items():
         if count < 1:
@@ -254,5 +260,3 @@ def _require_arguments(scene: object, sensor: int, seeds: int, spp: int, fd_spp:
     require_film(scene.sensors()[sensor], f"sensor {sensor}", counts)
     if seed < 0:
         raise PathreplayError(f"seed is {seed}; give a whole number of at least 0")
-    if mode not in ("backward", "forward"):
-        raise PathreplayError(f"mode is '{mode}'; choose 'backward' or 'forward'")

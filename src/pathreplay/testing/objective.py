@@ -8,7 +8,7 @@ noisy images is an unbiased sample of a difference of F.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Literal, TypeAlias
 
 import drjit as dr
@@ -110,10 +110,7 @@ class Objective:
 
     def derivative(self, integrator: mi.Integrator, mode: Mode, primal: int, seed: int, spp: int) -> float:
         """Compute dF/dt at 0 through ``mi.render``, with separate seeds for image and derivative, as in user code."""
-        name = integrator_name(integrator)
-        with errors_as(
-            f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode", (RuntimeError, TypeError)
-        ):
+        with self._explained(integrator, mode):
             t = self._attached()
             image = mi.render(
                 self.scene, self.params, sensor=self.sensor, integrator=integrator,
@@ -127,8 +124,9 @@ class Objective:
 
     def forward(self, integrator: mi.Integrator, seed: int, spp: int) -> np.ndarray:
         """Compute the derivative of the image at t = 0 by ``render_forward``, without rendering the primal image."""
-        dr.forward(self._attached(), dr.ADFlag.ClearEdges)
-        image = integrator.render_forward(self.scene, self.params, self.sensor, seed=seed, spp=spp)
+        with self._explained(integrator, "forward"):
+            dr.forward(self._attached(), dr.ADFlag.ClearEdges)
+            image = integrator.render_forward(self.scene, self.params, self.sensor, seed=seed, spp=spp)
         return np.array(image, np.float64)
 
     def backward(self, integrator: mi.Integrator, seed: int, spp: int) -> float:
@@ -158,6 +156,11 @@ class Objective:
         unit = np.finfo(get_array(self.value).dtype).eps / 2
         rounding = line.stencil.rounding() * unit * self.scale / line.step
         return judge(gradients, full, half, rounding=rounding, negligible=NEGLIGIBLE * self.scale / line.size)
+
+    def _explained(self, integrator: mi.Integrator, mode: Mode) -> AbstractContextManager[None]:
+        """Context that converts errors of the integrator's derivative into a PathreplayError."""
+        what = f"Integrator '{integrator_name(integrator)}' cannot differentiate '{self.key}' in {mode} mode"
+        return errors_as(what, (RuntimeError, TypeError))
 
     def _attached(self) -> mi.Float:
         """Return t = 0 with gradients enabled, after setting the parameter to its value at t."""

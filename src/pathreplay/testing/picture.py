@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.platform.traversal import traversed
-from pathreplay.testing.gradient import line_of
+from pathreplay.testing.gradient import line_of, require_arguments, require_types
 from pathreplay.testing.objective import Objective, alone, integrator_name
 from pathreplay.testing.reference import Spec, integrator_under_test, reference_integrator
 
@@ -65,8 +65,12 @@ def derivative_images(  # noqa: PLR0913 (all but two are keyword-only)
     some integrators of Mitsuba do not.
 
     Raises:
-        PathreplayError: a parameter without derivative, or an integrator that cannot differentiate it in forward mode.
+        PathreplayError: a bad argument, a parameter without derivative, or an integrator that cannot differentiate it
+            in forward mode.
     """
+    fd_spp = spp if fd_spp is None else fd_spp
+    require_types(key, sensor=sensor, seeds=seeds, spp=spp, fd_spp=fd_spp, seed=seed)
+    require_arguments(scene, sensor, seeds, spp, fd_spp, seed)
     params = traversed(scene)
     tested = integrator_under_test(integrator, scene, max_depth)
     line = line_of(params, key, tested, step, direction, seed)
@@ -75,9 +79,7 @@ def derivative_images(  # noqa: PLR0913 (all but two are keyword-only)
     with alone(params, key):
         objective = Objective(scene, params, key, line.move, sensor)
         gradient = np.mean([objective.forward(tested, word, spp) for word in words[:seeds]], axis=0)
-        differences = [
-            objective.difference(plain, line.stencil, line.step, word, fd_spp or spp) for word in words[seeds:]
-        ]
+        differences = [objective.difference(plain, line.stencil, line.step, word, fd_spp) for word in words[seeds:]]
     return DerivativeImages(
         key, integrator_name(tested), integrator_name(plain), gradient, np.mean(differences, axis=0)
     )
