@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes.scene_function import SceneFunction, View
 
 try:
@@ -82,7 +83,7 @@ def _function(render: RenderFunction, sensor: int, spp: int) -> Callable[..., ja
         return np.array(render.picture(_to_drjit(values), View(sensor, int(seed), spp)), np.float32)
 
     def gradient(seed: np.ndarray, weights: np.ndarray, *values: np.ndarray) -> tuple[np.ndarray, ...]:
-        gradients = render.gradient(_to_drjit(values), View(sensor, int(seed), spp), mi.TensorXf(np.array(weights)))
+        gradients = render.gradient(_to_drjit(values), View(sensor, int(seed), spp), _to_drjit((weights,))[0])
         return tuple(np.array(value, np.float32) for value in gradients)
 
     call = partial(jax.pure_callback, vmap_method="sequential")
@@ -105,9 +106,9 @@ def _function(render: RenderFunction, sensor: int, spp: int) -> Callable[..., ja
 
 def _size(render: RenderFunction, sensor: int) -> tuple[int, ...]:
     """Return height, width and channels of a sensor's images, from a rendering with one sample per pixel."""
-    start = [mi.TensorXf(render._start[key]) for key in render.keys]
+    start = _to_drjit(tuple(render._start[key] for key in render.keys))
     return tuple(render.picture(start, View(sensor, 0, 1)).shape)
 
 
 def _to_drjit(values: tuple[np.ndarray, ...]) -> list[mi.TensorXf]:
-    return [mi.TensorXf(np.array(value, np.float32)) for value in values]
+    return [mi.TensorXf(with_space(np.array(value, np.float32))) for value in values]

@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.device import backend_of
+from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes.scene_function import SceneFunction, View
 
 try:
@@ -75,13 +76,15 @@ class _Rendering(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        weights = mi.TensorXf(grad.contiguous())
+        (weights,) = _to_drjit((grad,))
         gradients = ctx.render.gradient(_to_drjit(ctx.saved_tensors), ctx.view, weights)
         return None, None, *(_to_torch(value, ctx.render.device) for value in gradients)
 
 
 def _to_drjit(tensors: tuple[torch.Tensor, ...]) -> list[mi.TensorXf]:
-    return [mi.TensorXf(tensor.detach().contiguous()) for tensor in tensors]
+    """Convert tensors of PyTorch. On the CPU, Dr.Jit uses their memory in place (see `with_space`)."""
+    detached = [tensor.detach().contiguous() for tensor in tensors]
+    return [mi.TensorXf(tensor if tensor.is_cuda else with_space(tensor.numpy())) for tensor in detached]
 
 
 def _to_torch(tensor: dr.ArrayBase, device: torch.device) -> torch.Tensor:

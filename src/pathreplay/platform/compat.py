@@ -23,6 +23,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from pathreplay.platform.owned_arrays import with_space
+
 POSITIONS = "vertex_positions", "positions"
 """Names of the parameter that consists of the positions of a mesh, in 3.9 and 3.10."""
 NORMALS = "vertex_normals", "normals"
@@ -31,7 +33,6 @@ _FACES = "faces"
 _SHADING = "Default"  # a flag that only 3.10 has
 _FROM_FIELDS = "from_fields"  # a method of meshes in 3.10, which sets faces, positions and other data
 _PREFIXES = "vertex_", "face_"
-_SPACE = 64  # number of unused entries that are allocated after the values of an array
 _OTHERS = _FACES, "bsdf_index", "position_index", "normal_index"
 
 
@@ -235,17 +236,6 @@ def has_normals(mesh: mi.Mesh) -> bool:
     return bool(getattr(mesh, name)())
 
 
-def _with_space(values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Copy the values into a larger allocation.
-
-    Dr.Jit uses the memory of a NumPy array in place. On LLVM, Dr.Jit reads whole packets, which may extend beyond the
-    end of the array. If the array ends at the end of a memory page, such a read crashes the process.
-    """
-    result = np.zeros(values.size + _SPACE, values.dtype)
-    result[: values.size] = values
-    return result[: values.size]
-
-
 def new_mesh(
     vertices: NDArray[np.floating],
     faces: NDArray[np.integer],
@@ -275,8 +265,8 @@ def new_mesh(
     )
     params = mi.traverse(mesh)
     if texcoords is not None:
-        params[TEXCOORDS[0]] = mi.Float(_with_space(texcoords.astype(np.float32).ravel()))
-    params[POSITIONS[0]] = mi.Float(_with_space(points.ravel()))
-    params[_FACES] = mi.UInt32(_with_space(corners.ravel()))
+        params[TEXCOORDS[0]] = mi.Float(with_space(texcoords.astype(np.float32).ravel()))
+    params[POSITIONS[0]] = mi.Float(with_space(points.ravel()))
+    params[_FACES] = mi.UInt32(with_space(corners.ravel()))
     params.update()
     return mesh

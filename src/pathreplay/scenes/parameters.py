@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.owned_arrays import with_space
 
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
@@ -256,7 +257,7 @@ def to_value(like: SceneValue | float, array: ArrayLike) -> Any:
     given = np.asarray(array)
     if given.shape != expected.shape:
         raise PathreplayError(f"Value of shape {given.shape} given for a parameter of shape {expected.shape}")
-    given = np.ascontiguousarray(given, dtype=expected.dtype)
+    given = with_space(np.ascontiguousarray(given, dtype=expected.dtype))
     if isinstance(like, float):
         return float(given[0])
     if is_transform(like):

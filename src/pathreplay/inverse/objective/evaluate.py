@@ -41,7 +41,7 @@ from pathreplay.inverse.parameters.response import gradient as response_gradient
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem, scene_values, sensor_of
 from pathreplay.platform import memory
-from pathreplay.platform.owned_arrays import owned
+from pathreplay.platform.owned_arrays import owned, with_space
 from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
@@ -191,7 +191,7 @@ def release(values: Arrays) -> None:
 
 def owned_tensor(picture: Array) -> mi.TensorXf:
     """Copy an image into memory that Dr.Jit owns: see `owned`."""
-    tensor = owned(mi.TensorXf(np.ascontiguousarray(picture)))
+    tensor = owned(mi.TensorXf(with_space(np.ascontiguousarray(picture))))
     dr.eval(tensor)
     return tensor
 

@@ -14,6 +14,7 @@ from pathreplay.inverse.config.schema import BATCH
 from pathreplay.inverse.losses.pixelwise import QUADRATIC
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.inverse.problem.problem import Problem
+from pathreplay.platform.owned_arrays import with_space
 
 
 @dataclass
@@ -35,7 +36,9 @@ class Batch:
         count = n if among is None else len(among)
         numbers = np.random.default_rng([BATCH, seed]).choice(count, min(most, count), replace=False)
         chosen = np.sort(numbers if among is None else among[numbers]).astype(np.uint32)
-        pixels = mi.UInt32(chosen) + dr.opaque(mi.UInt32, 0)  # copy to memory that Dr.Jit owns, see `variables_of`
+        pixels = mi.UInt32(with_space(chosen)) + dr.opaque(
+            mi.UInt32, 0
+        )  # copy to memory that Dr.Jit owns, see `variables_of`
         dr.eval(pixels)
         return Batch(pixels, count / n)
 

@@ -24,6 +24,7 @@ from pathreplay.inverse.config.user_functions import Imported
 from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.neighbours import neighbours
 from pathreplay.inverse.parameters.values import Array
+from pathreplay.platform.owned_arrays import with_space
 
 ROUND = 1e-3
 """Smoothing length r of total variation, which is quadratic for differences much smaller than r."""
@@ -122,7 +123,7 @@ class Own:
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
         """See `Term`. Raises PathreplayError if the function fails, or its value or gradient is not finite."""
-        v = mi.TensorXf(np.ascontiguousarray(values))
+        v = mi.TensorXf(with_space(np.ascontiguousarray(values)))
         dr.enable_grad(v)
         copy = mi.TensorXf(v)  # which the function may modify
         value = self.function(lambda value: mi.TensorXf(value).array, copy)
@@ -182,7 +183,7 @@ def laplacian(positions: ArrayLike, faces: ArrayLike) -> Callable[[mi.TensorXf],
 def _differentiable(term: Term, values: mi.TensorXf) -> mi.TensorXf:
     """Evaluate a term as a Dr.Jit tensor that has first derivatives, but no second derivatives."""
     value, slope = term(np.array(dr.detach(values)))
-    linear = dr.sum((values - dr.detach(values)) * mi.TensorXf(slope.astype(np.float32)), axis=None)
+    linear = dr.sum((values - dr.detach(values)) * mi.TensorXf(with_space(slope.astype(np.float32))), axis=None)
     return linear + value
 
 

@@ -27,6 +27,7 @@ from pathreplay.inverse.parameters.reparameterization import Coordinates, Transf
 from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.values import Array, make_heights, make_value, require_finite_array, seen
 from pathreplay.platform import compat
+from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes import parameters
 from pathreplay.scenes.parameters import SceneValue
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
@@ -64,7 +65,9 @@ class Variable:
 
     def held(self, values: Array) -> dr.ArrayBase:
         """Convert an array of values to Dr.Jit. The resolution of a grid may differ from the initial resolution."""
-        return type(self.like)(values) if dr.is_tensor_v(self.like) else parameters.to_value(self.like, values)
+        return (
+            type(self.like)(with_space(values)) if dr.is_tensor_v(self.like) else parameters.to_value(self.like, values)
+        )
 
 
 def latents(variables: Iterable[Variable], values: Mapping[str, Array]) -> dict[str, Array]:
