@@ -87,6 +87,14 @@ def test_a_file_that_is_no_library_fails_its_trial_with_a_reason(bogus: str) -> 
     assert bogus in library.message and "\n" not in library.message
 
 
+def test_a_library_is_tried_once_whoever_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[str] = []
+    monkeypatch.setattr(llvm, "run_trial", lambda code, task, environment: ("", tried.append("once") or "fails"))
+    path = str(tmp_path / "libLLVM.so")
+    assert [llvm.probe(path, origin).origin for origin in ("", "system")] == ["", "system"]
+    assert tried == ["once"]
+
+
 @pytest.mark.parametrize("path", llvm.system_libraries())
 def test_a_library_of_the_system_is_the_version_that_its_name_says_or_fails_with_a_reason(
     path: str, monkeypatch: pytest.MonkeyPatch

@@ -222,18 +222,24 @@ def run_trial(code: str, task: Mapping[str, object], environment: Mapping[str, s
     return done.stdout, "" if done.returncode == 0 else _reason(done.returncode, done.stderr)
 
 
-@functools.cache
 def probe(path: str, origin: str = "") -> LlvmLibrary:
     """Test one libLLVM in a subprocess, by comparing minimum, maximum and a gradient with known values.
 
     An empty `path` tests the library that Dr.Jit chooses itself. The result is cached for the lifetime of this process.
     Raises nothing: failures are reported in `works` and `message`.
     """
+    version, message = _tested(path)
+    return LlvmLibrary(path, origin, version, not message, message)
+
+
+@functools.cache
+def _tested(path: str) -> tuple[str, str]:
+    """Test one libLLVM. Return its version, and the reason why it does not work ("" if it works)."""
     version = ".".join(map(str, version_in_path(os.path.realpath(path))))
     # A cached kernel would bypass the compiler under test.
     environment = os.environ | {ENVIRONMENT_VARIABLE: path, "DRJIT_CACHE_DIR": os.devnull}
     stdout, message = run_trial(_PROBE, {"preload": unlinked_siblings(path)}, environment)
-    return LlvmLibrary(path, origin, stdout.strip() or version, not message, message)
+    return stdout.strip() or version, message
 
 
 def find_llvm() -> LlvmLibrary:
