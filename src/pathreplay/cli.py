@@ -84,13 +84,19 @@ def doctor(
         bool, typer.Option("--gpu", help="Run gradient checks and timings on the GPU, and write a file.")
     ] = False,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="With --gpu: the file to write.")
-    ] = Path("pathreplay-gpu.json"),
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="With --gpu: file to write (default: pathreplay-gpu.json)."
+        ),
+    ] = None,
     variant: Annotated[str | None, typer.Option(help="With --gpu: Mitsuba variant (default: cuda_ad_rgb).")] = None,
 ) -> None:
     """Report what runs on this machine, and the remedy for what does not."""
     from rich.console import Console
 
+    if not gpu and (output or variant):
+        raise PathreplayError(f"{'--output' if output else '--variant'} needs --gpu; add --gpu, or leave it out")
+    output = output or Path("pathreplay-gpu.json")
     if gpu:
         from pathreplay.testing.gpu import examine as examine_gpu
 

@@ -169,6 +169,15 @@ def test_other_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> N
         cli.main()
 
 
+@pytest.mark.parametrize(("option", "value"), [("--output", "x.json"), ("--variant", "llvm_ad_rgb")])
+def test_the_doctor_refuses_options_that_need_a_gpu(run, option: str, value: str) -> None:
+    assert run("doctor", option, value) == (
+        2,
+        "",
+        f"pathreplay: error: {option} needs --gpu; add --gpu, or leave it out\n",
+    )
+
+
 @pytest.mark.parametrize(("works", "expected"), [(True, 0), (False, 1)])
 def test_the_doctor_ends_with_what_it_found(run, monkeypatch: pytest.MonkeyPatch, works: bool, expected: int) -> None:
     from pathreplay.doctor import DoctorReport, VariantVerdict
