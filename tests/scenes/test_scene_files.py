@@ -89,7 +89,13 @@ def test_volumes_are_as_long_as_they_say(sides: tuple[int, ...], tmp_path: Path)
 
 def test_included_files_are_regular_ones(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "part.xml")
-    assert "part.xml is a pipe" in refused(tmp_path, '<include filename="part.xml"/>')
+    line = refused(tmp_path, '<include filename="part.xml"/>')
+    assert "part.xml is a pipe; include a readable XML file" in line
+
+
+def test_long_scene_files_are_told_to_store_meshes_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pathreplay.scenes.scene_files.LONGEST", 10)
+    assert "more than the limit of 10; store meshes and textures in separate files" in refused(tmp_path, "")
 
 
 def test_nesting_has_a_bound_in_included_files_too(tmp_path: Path) -> None:

@@ -33,7 +33,9 @@ def require_shallow(path: Path) -> None:
         if file.resolve() in seen or problem == MISSING:
             continue  # Mitsuba reports cycles and missing files
         if problem:
-            raise PathreplayError(f"Scene {file} {problem}; store meshes and textures in separate files")
+            is_long = not file_problem(file)
+            remedy = "store meshes and textures in separate files" if is_long else "include a readable XML file"
+            raise PathreplayError(f"Scene {file} {problem}; {remedy}")
         seen.add(file.resolve())
         waiting += [path.parent / name for name in _included(file)]
 
