@@ -87,3 +87,9 @@ except pathreplay.PathreplayError as error:
     print(error)
 """
     assert run_python(code).stdout == f"{name} is not installed: pip install {module}, or 'pathreplay[{module}]'\n"
+
+
+def test_arguments_of_a_loaded_scene_are_refused() -> None:
+    scene = load_scene("cornell-box", resolution=4)
+    with pytest.raises(PathreplayError, match=r"arguments \(resolution\) cannot be given for a loaded scene"):
+        SceneFunction(scene, WALL, integrator=PLAIN, arguments={"resolution": 8})

@@ -57,6 +57,10 @@ class SceneFunction:
         patterns = [keys] if isinstance(keys, str) else list(keys)
         if isinstance(scene, (str, Path)):
             scene = load_scene_for(scene, patterns, **(arguments or {}))[0]
+        elif arguments:
+            raise PathreplayError(
+                f"arguments ({', '.join(arguments)}) cannot be given for a loaded scene; leave them out"
+            )
         self.integrator = load_integrator(integrator or {"type": "pathreplay"})
         if not isinstance(self.integrator, mi.CppADIntegrator):
             raise PathreplayError(
