@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from pathreplay.adjoint.record import MAX_DEPTH
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators import integrator as integrators
 from pathreplay.integrators.film.filter_samples import FilterSamples, is_drawable
@@ -305,6 +306,13 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "late": ({"stages": [{"iterations": 2}, {"iterations": 1, "max_depth": 1500}]}, "of 1500 vertices"),
     "camera": (MOVED, "its camera moves; freeze 'sensor.to_world', or leave 'pixel_batch_size' out"),
 }
+
+
+def test_too_long_paths_are_refused_with_a_remedy_that_helps() -> None:
+    scene = mi.load_dict(room(**FILMS["box"]))
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": MAX_DEPTH})
+    line = f"a record cannot hold two paths of {MAX_DEPTH} vertices; lower max_depth"
+    assert [integrator.why_no_pixel_sweep(scene, spp=spp) for spp in (1, 2, 4)] == [line] * 3
 
 
 @pytest.mark.parametrize("why", REFUSED)

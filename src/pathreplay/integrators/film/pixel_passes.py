@@ -26,6 +26,20 @@ def _largest_spp(max_depth: int) -> int:
     return device.most_records(LARGEST_RECORD, MAX_DEPTH) // device.room(max(max_depth, 1))
 
 
+def _why_no_sets(max_depth: int, spp: int) -> str:
+    """Return why ``spp`` paths cannot be recorded and form independent sets, with the remedy; "" if they can."""
+    most = _largest_spp(max_depth)
+    if most < 2:
+        return f"a record cannot hold two paths of {max_depth} vertices; lower max_depth"
+    if spp < 2:
+        return f"{spp} samples per pixel cannot provide independent loss derivatives for each other; take 2 or more"
+    if spp > most:
+        return (
+            f"{spp} samples per pixel of {max_depth} vertices are more than the {most} that a record holds; take fewer"
+        )
+    return ""
+
+
 def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) -> str:
     """Return why `pixel_sweep` does not support a sensor, with the remedy; "" if it does.
 
@@ -40,8 +54,7 @@ def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) ->
     film.prepare([])
     with dr.resume_grad():
         ray, _ = sensor.sample_ray_differential(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
-    format, most = film.bitmap().pixel_format(), _largest_spp(max_depth)
-    box = film.rfilter().is_box_filter()
+    format, box = film.bitmap().pixel_format(), film.rfilter().is_box_filter()
     if not mi.is_rgb:
         return f"variant {mi.variant()!r} does not use rgb colours; take an rgb variant"
     if not box and not some:
@@ -56,13 +69,7 @@ def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) ->
         return "its shutter stays open for a time; set shutter_close to shutter_open"
     if dr.grad_enabled(ray.o, ray.d):
         return "it moves; freeze it"
-    if spp < 2:
-        return f"{spp} samples per pixel cannot provide independent loss derivatives for each other; take 2 or more"
-    if spp > most:
-        return (
-            f"{spp} samples per pixel of {max_depth} vertices are more than the {most} that a record holds; take fewer"
-        )
-    return ""
+    return _why_no_sets(max_depth, spp)
 
 
 def pixel_camera(sensor: mi.Sensor, pixel: mi.UInt32) -> Callable[..., tuple[mi.Ray3f, mi.Spectrum]]:
@@ -109,11 +116,8 @@ def pixel_loss(
 
     Raises PathreplayError for an unsuitable number of samples, a wrong shape, or repeated or invalid pixels.
     """
-    if not 1 < view.spp <= _largest_spp(max_depth):
-        raise PathreplayError(
-            f"pathreplay: {view.spp} samples per pixel of {max_depth} vertices do not suit a pixel sweep: "
-            f"use 2 or more, with at most {MAX_DEPTH} vertices in total, or mi.render"
-        )
+    if why := _why_no_sets(max_depth, view.spp):
+        raise PathreplayError(f"pathreplay: {why}, or use mi.render")
     width, height = view.size
     shape = (height, width, 3) if pixels is None else (dr.width(pixels), 1, 3)
     for tensor in (offset, slope):
