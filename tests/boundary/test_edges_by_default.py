@@ -134,6 +134,20 @@ def test_all_edges_are_differentiated_where_one_moves(log: list[str]) -> None:
     assert len([line for line in log if "boundary = 'none' of the integrator leaves them out" in line]) == 1
 
 
+def test_each_scene_is_warned_of_once(log: list[str]) -> None:
+    integrator, sky = ours(), {"type": "constant"}
+    scenes = [mi.load_dict({"type": "scene", "cam": ROOM["cam"], "card": {"type": "rectangle"}, "sky": sky})] * 2
+    scenes[1] = mi.load_dict({"type": "scene", "cam": ROOM["cam"], "card": {"type": "disk"}, "sky": sky})
+    for scene in (*scenes, *scenes):
+        gradient(scene, "card.to_world", integrator)
+    cost = [line for line in log if "boundary = 'none' of the integrator leaves them out" in line]
+    assert len(cost) == 2
+    integrator.silence(["a note"])
+    assert "a note" in integrator.warned and len(integrator.warned) == 2
+    integrator.begin(scenes[0])
+    assert "a note" in integrator.warned
+
+
 def test_nothing_is_traced_where_only_paint_moves(room: mi.Scene) -> None:
     """The same bits from as many kernels, for texture coordinates too, with which paths do move."""
     for key in ("wall.bsdf.reflectance.value", "card.vertex_texcoords"):

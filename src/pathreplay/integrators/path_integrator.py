@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import reduce
 from operator import add
+from weakref import WeakKeyDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +22,7 @@ from pathreplay.integrators.parts import parts, summed
 from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.properties import HIDE_EMITTERS, MAX_DEPTH, PATHS, RR_DEPTH, flag, whole_number
 from pathreplay.integrators.reach import unreached_note
-from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.integrators.scene_facts import SceneFacts, facts_of
 from pathreplay.integrators.stateful import Unlearned
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.registration import mitsuba_integrator
@@ -94,7 +95,9 @@ class PathIntegrator(Unlearned):
         hide_emitters = flag(props, self.name, HIDE_EMITTERS)
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
-        self.warned: set[str] = set()  # notes that were logged or silenced
+        self.warned: set[str] = set()  # notes about the scene of the last pass that were logged or silenced
+        self._silenced: set[str] = set()
+        self._warned_of: WeakKeyDictionary[SceneFacts, set[str]] = WeakKeyDictionary()  # `warned` of each scene
         # Lookup tables of the last rendered scene, for functions of the user that `dr.freeze` records.
         self.tables: Tables | None = None
 
@@ -216,6 +219,7 @@ class PathIntegrator(Unlearned):
         """
         with careful():
             facts = facts_of(scene)
+            self.warned = self._warned_of.setdefault(facts, set(self._silenced))
             if is_recording():
                 return PassState(facts.recorded_tables(self.tables, edges=False))
             facts.enclose(scene)
@@ -295,7 +299,8 @@ class PathIntegrator(Unlearned):
         return False
 
     def silence(self, notes: Iterable[str]) -> None:
-        self.warned.update(notes)
+        for some in (self._silenced, self.warned, *self._warned_of.values()):
+            some.update(notes)
 
     def _described(self, **more: object) -> str:
         depth = -1 if self.max_depth == UNBOUNDED else self.max_depth

@@ -32,10 +32,10 @@ class StatefulIntegrator(Protocol):
 
     @property
     def warned(self) -> Collection[str]:
-        """Notes that were logged or silenced."""
+        """Notes that were logged about the scene of the last pass, or silenced."""
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Suppress the given notes."""
+        """Suppress the given notes, about all scenes."""
 
     def is_recordable(self, has_media: bool) -> bool:
         """Return whether `dr.freeze` is expected to record passes of this integrator."""
