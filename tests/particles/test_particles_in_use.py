@@ -551,3 +551,15 @@ def test_check_passes_light_paths() -> None:
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
     assert "particle (backward)" in done.output, done.output
+
+
+def test_a_repeated_seed_uses_no_control_variate_of_its_own(log: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pathreplay.integrators.particles.integrator.MOST_RAYS", 1)
+    scene, key = loaded(misty("area")), "mist.interior_medium.sigma_t.value.value"
+    params = mi.traverse(scene)
+    dr.enable_grad(params[key])
+    params.update()
+    integrator = mi.load_dict(PARTICLES)
+    for _ in range(2):  # 17 samples per pixel, of which the camera rays take 16
+        integrator.render_backward(scene, params, mi.TensorXf(weights(scene)), 0, seed=5, spp=17)
+    assert len([line for line in log if "seed 5 was used before" in line]) == 1

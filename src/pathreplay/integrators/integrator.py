@@ -370,7 +370,7 @@ class PathReplayIntegrator(PathIntegrator):
             self._warn_once(doubt)
         if trace.media is None or state.guess is None:
             return None
-        if state.passes.intersection(view.keys):
+        if state.passes.intersection(self._camera_view(view).keys):
             self._warn_once(used_before_note(view.keys[0][0]))
             return None
         return state.guess
