@@ -249,6 +249,12 @@ def test_another_depth_or_boundary_leaves_the_other_properties_of_an_own_pathrep
     assert stateful(edges).options() == options | {"attach": "delta", "boundary": "primary"}
 
 
+def test_a_boundary_that_follows_from_attach_is_not_copied_without_it() -> None:
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "pathreplay", "attach": "none"}})
+    assert stateful(scene.integrator()).boundary == "none"
+    assert stateful(integrator_under_test("pathreplay", scene)).boundary == "auto"
+
+
 def test_another_depth_or_boundary_leaves_an_own_pathreplay_particles() -> None:
     own = {"type": "pathreplay_particles", "max_depth": 6, "hide_emitters": True, "attach": "none"}
     scene = mi.load_dict({"type": "scene", "integrator": own})
@@ -257,7 +263,7 @@ def test_another_depth_or_boundary_leaves_an_own_pathreplay_particles() -> None:
         tested = integrator_under_test(None, scene, **changes)
         assert type(tested) is type(scene.integrator())
         assert read_limits(tested) == Limits(depth, 5, True)
-        assert stateful(tested).options() == options and options["attach"] == "none"
+        assert stateful(tested).options() == options | changes.get("boundary", {}) and options["attach"] == "none"
     named = integrator_under_test("pathreplay_particles", scene, boundary={"boundary": "none", "boundary_spp": 3})
     assert stateful(named).options()["boundary_spp"] == 3
     with pytest.raises(PathreplayError, match="'boundary' is a property of 'pathreplay', and the integrator is 'prb'"):

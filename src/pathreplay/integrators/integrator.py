@@ -113,7 +113,7 @@ class PathReplayIntegrator(PathIntegrator):
         self.interior = _interior(self.name, props, self.max_depth)
         self.adjoint, self.null_branching = self.interior.adjoint, self.interior.branch
         self.uses_sobol = choice(props, self.name, declared.SAMPLING) == "sobol"
-        self.boundary = choice(props, self.name, declared.BOUNDARY)
+        self.boundary = self._declared_boundary = choice(props, self.name, declared.BOUNDARY)
         self.boundary_spp = whole_number(
             props, self.name, declared.BOUNDARY_SPP, lowest=0, kind="number of segments per pixel"
         )
@@ -410,14 +410,14 @@ class PathReplayIntegrator(PathIntegrator):
             mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
     def options(self) -> Json:
-        """Return the properties of this integrator, except for the properties of `PathIntegrator`."""
+        """Return the properties as they were declared, except for the properties of `PathIntegrator`."""
         return {
             "adjoint": "auto" if self.interior.auto else self.adjoint,
             "attach": self.attach,
             "jacobian_noise": self.interior.recovery.noise,
             "null_branching": self.null_branching,
             "sampling": declared.SAMPLING.choices[self.uses_sobol],
-            "boundary": self.boundary,
+            "boundary": self._declared_boundary,
             "boundary_spp": self.boundary_spp,
             "caustics": self.caustics,
         }
