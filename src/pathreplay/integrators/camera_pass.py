@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
+from types import SimpleNamespace
 from typing import TypeAlias
 
 import drjit as dr
@@ -38,24 +39,6 @@ class Rays:
     @property
     def start(self) -> CameraStart:
         return CameraStart(self.ray, self.sampler, mi.Bool(True))
-
-
-@dataclass(frozen=True)
-class _CameraSampler:
-    """Adapter of a Sobol sampler to the interface that Mitsuba's `sample_rays` expects."""
-
-    sampler: OwenSobolSampler
-    count: int
-
-    def sample_count(self) -> int:
-        """Number of paths per pixel."""
-        return self.count
-
-    def next_1d(self) -> mi.Float:
-        return self.sampler.next_1d()
-
-    def next_2d(self) -> mi.Point2f:
-        return self.sampler.next_2d()
 
 
 @dataclass(frozen=True)
@@ -115,7 +98,10 @@ class Pass:
             width, height = (n + border for n in self.size)
             i = dr.arange(mi.UInt32, width * height * spp)
             sampler = self.sobol_sampler(i // spp, width, i % spp, spp)
-        camera = _CameraSampler(sampler, spp) if self.uses_sobol else sampler
+            # `sample_rays` also needs the number of paths per pixel.
+            camera = SimpleNamespace(sample_count=lambda: spp, next_1d=sampler.next_1d, next_2d=sampler.next_2d)
+        else:
+            camera = sampler
         ray, weight, position = mitsuba.sample_rays(None, self.scene, _PassSensor(self), camera)
         return Rays(sampler, ray, weight, position, spp)
 
