@@ -152,7 +152,7 @@ class PathReplayIntegrator(PathIntegrator):
     def _image(self, part: Pass, trace: TraceConfig) -> mi.TensorXf:
         """Render the image of camera paths and, if there are any, light paths."""
         lit = None if self.particles is None else self.particles.image(part, trace)
-        image = PathIntegrator._image(self, part, trace)
+        image = PathIntegrator._image(self, self._camera_view(part), trace)
         return image if lit is None else image + lit
 
     def _camera_view(self, view: Pass) -> Pass:

@@ -26,12 +26,6 @@ def _shines(emitter: mi.Emitter) -> bool:
     return on_surface or emitter.is_environment()
 
 
-def _few_rays(view: Pass) -> Pass:
-    """Limit the number of camera rays of a pass."""
-    width, height = view.size
-    return replace(view, spp=min(view.spp, max(MOST_RAYS // (width * height), LEAST_A_PIXEL)))
-
-
 class ParticleIntegrator(PathReplayIntegrator):
     """Differentiable particle tracer for surfaces and media.
 
@@ -61,12 +55,6 @@ class ParticleIntegrator(PathReplayIntegrator):
         PathReplayIntegrator.__init__(self, props)
         self.particles = ParticleTerm(self.max_depth, caustics=False)
 
-    def _image(self, part: Pass, trace: TraceConfig) -> mi.TensorXf:
-        """Render the image of directly visible emitters and of light paths."""
-        lit = self.particles.image(part, trace)
-        image = PathIntegrator._image(self, _few_rays(part), trace)
-        return image if lit is None else image + lit
-
     def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """Leave out the terms of the camera rays if no emitter is visible to the sensor."""
         if self.hide_emitters or not any(map(_shines, view.scene.emitters())):
@@ -74,7 +62,9 @@ class ParticleIntegrator(PathReplayIntegrator):
         return PathReplayIntegrator._planned(self, view, state, follow)
 
     def _camera_view(self, view: Pass) -> Pass:
-        return _few_rays(view)
+        """Limit the number of camera rays of a pass."""
+        width, height = view.size
+        return replace(view, spp=min(view.spp, max(MOST_RAYS // (width * height), LEAST_A_PIXEL)))
 
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
         """Return the configuration of the camera rays, which see emitters directly."""
