@@ -56,9 +56,9 @@ class Boundary(Term):
     spp: int = 0  # segments per pixel of each search; 0 means the samples per pixel of the pass
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        places = FilmPlaces.of(view)
-        if not _move(trace, places):
+        if not self.move(view, trace):
             return TermResult()
+        places = FilmPlaces.of(view)
         image = None
         for edges in self._searches(view, trace, places):
             δL = edges_forward(trace, places, edges)
@@ -67,9 +67,9 @@ class Boundary(Term):
         return TermResult(image)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        places = FilmPlaces.of(view)
-        if not _move(trace, places):
+        if not self.move(view, trace):
             return TermResult()
+        places = FilmPlaces.of(view)
         block_grad = places.undeveloped(grad_in)
 
         lost, paths = NonFiniteCounter(), 0
@@ -83,7 +83,11 @@ class Boundary(Term):
     @staticmethod
     def move(view: Pass, trace: TraceConfig) -> bool:
         """Return whether edges depend on parameters with gradients. Dr.Jit traces the test, but evaluates nothing."""
-        return _move(trace, FilmPlaces.of(view))
+        key = mi.UInt32(0)
+        with dr.resume_grad():
+            ray, _ = FilmPlaces.of(view).ray(mi.Point2f(0.5), key)
+        start = CameraStart(ray, CounterSampler.of(key), mi.Bool(True))
+        return edges_move(trace, start, PathState.begin(trace, start).at)
 
     @staticmethod
     def informed(view: Pass, trace: TraceConfig) -> TraceConfig:
@@ -97,7 +101,9 @@ class Boundary(Term):
         meter = view.sensor.get_shape()
         if meter is not None and with_gradients(meter):
             return trace  # rays start on a moving shape: all surfaces move relative to these rays
-        moving, turning = moving_shapes(trace.scene, _still_cameras(view))
+        # With a film flow, the sensor of the pass counts as static, too: `FilmDomain.flows` marks the rays that move.
+        static = [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
+        moving, turning = moving_shapes(trace.scene, static)
         return replace(trace, traits=replace(trace.traits, moving=moving, turning=turning))
 
     @staticmethod
@@ -154,21 +160,3 @@ def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
             f"Dr.Jit can process at once; take boundary_spp up to {MOST_SAMPLES // pixels}, or 0"
         )
     return max(n, 1)
-
-
-def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Return the sensors that are treated as static.
-
-    All sensors except the sensor of the pass are treated as static. If the pass has a film flow, the sensor of the pass
-    is treated as static, too: `FilmDomain.flows` then marks the camera rays that move.
-    """
-    return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
-
-
-def _move(trace: TraceConfig, places: FilmPlaces) -> bool:
-    """Return whether edges move with the parameters: see `edges_move`."""
-    key = mi.UInt32(0)
-    with dr.resume_grad():
-        ray, _ = places.ray(mi.Point2f(0.5), key)
-    start = CameraStart(ray, CounterSampler.of(key), mi.Bool(True))
-    return edges_move(trace, start, PathState.begin(trace, start).at)
