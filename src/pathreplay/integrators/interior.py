@@ -14,7 +14,6 @@ from pathreplay.adjoint.driver import Driver, ForwardDriver
 from pathreplay.adjoint.emission_only import lights_or
 from pathreplay.adjoint.forward import forward
 from pathreplay.adjoint.pixel_sweep import PixelLoss, pixel_sweep
-from pathreplay.adjoint.primal import primal
 from pathreplay.adjoint.ray_jacobian import Recovery
 from pathreplay.adjoint.record import deepest
 from pathreplay.adjoint.replay import replay
@@ -25,12 +24,6 @@ from pathreplay.integrators.film.pixel_passes import pixel_camera
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.device import device_of
 from pathreplay.transport.vertex import TraceConfig
-
-
-def image(view: Pass, trace: TraceConfig) -> mi.TensorXf:
-    """Render the image of a pass (height x width x channels)."""
-    rays = view.rays()
-    return splat(view, rays, *primal(trace, rays.start))
 
 
 def tangent(view: Pass, trace: TraceConfig, driver: ForwardDriver) -> TermResult:
@@ -80,11 +73,13 @@ class PathReplay(Term):
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         trace = self._with_baseline(trace, learned)
-        if not self._sweeps(trace):
-            driver = partial(replay, recovery=self.recovery)
-            return back_propagate(view, replace(trace, baseline=None), grad_in, self._or_emission_only(driver))
-        stats = None if learned is None or trace.media is None else BaselineStats.none(learned.cells, *view.keys)
-        result = back_propagate(view, trace, grad_in, self._or_emission_only(partial(sweep, seen=stats)))
+        stats, driver = None, partial(replay, recovery=self.recovery)
+        if self._sweeps(trace):
+            stats = None if learned is None or trace.media is None else BaselineStats.none(learned.cells, *view.keys)
+            driver = partial(sweep, seen=stats)
+        else:
+            trace = replace(trace, baseline=None)
+        result = back_propagate(view, trace, grad_in, lights_or(driver) if self.auto else driver)
         return replace(result, stats=stats)
 
     def pixels(self, view: Pass, trace: TraceConfig, loss: PixelLoss, some: mi.UInt32 | None) -> TermResult:
@@ -100,10 +95,6 @@ class PathReplay(Term):
         dr.eval(L)  # the kernel of L also computes the gradients
         image = mi.TensorXf(dr.ravel(L), (height, width, 3) if some is None else (lanes, 1, 3))
         return TermResult(image, lost=lost.count, paths=lanes * view.spp, moves=True) if moves else TermResult(image)
-
-    def _or_emission_only(self, driver: Driver) -> Driver:
-        """Return a driver. With ``auto``, the result runs `emission_only` if only emitters have gradients."""
-        return lights_or(driver) if self.auto else driver
 
     def note(self, trace: TraceConfig) -> str:
         """Return a message if paths are replayed because records do not fit into GPU memory, otherwise ""."""

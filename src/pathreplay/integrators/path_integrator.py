@@ -16,7 +16,7 @@ from pathreplay.adjoint.baseline import Baseline
 from pathreplay.adjoint.primal import primal
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass, Seed, Which
-from pathreplay.integrators.interior import image
+from pathreplay.integrators.film.image import splat
 from pathreplay.integrators.lifetimes import careful, is_recording
 from pathreplay.integrators.parts import parts, summed
 from pathreplay.integrators.pass_state import PassState
@@ -230,7 +230,9 @@ class PathIntegrator(Unlearned):
         """Log warnings about the passes since `begin`, and update the learned state from their results."""
 
     def _image(self, part: Pass, trace: TraceConfig) -> mi.TensorXf:
-        return image(part, trace)
+        """Render the image of a pass (height x width x channels)."""
+        rays = part.rays()
+        return splat(part, rays, *primal(trace, rays.start))
 
     def _forward(self, terms: tuple[Term, ...], part: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         return reduce(add, [term.forward(part, trace, learned) for term in terms])
@@ -253,15 +255,12 @@ class PathIntegrator(Unlearned):
 
     def pass_of(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:
         """Create a pass from the arguments of Mitsuba's methods."""
-        self._require_active(scene)
-        return Pass.of(scene, sensor, seed, spp, self.uses_sobol)
-
-    def _require_active(self, scene: mi.Scene) -> None:
         if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
             raise PathreplayError(
                 f"{self.name}: scene or integrator belongs to another variant than the active one, "
                 f"{mi.variant()!r}: load it anew, or set its variant"
             )
+        return Pass.of(scene, sensor, seed, spp, self.uses_sobol)
 
     @contextmanager
     def _pass_context(self) -> Iterator[None]:
