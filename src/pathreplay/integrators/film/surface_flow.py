@@ -110,12 +110,7 @@ class SurfaceFlow:
         """Return whether a moving surface is visible near a film position."""
         return dr.gather(mi.Bool, self.flows, Cell.at(position).first_node())
 
-    def leaves_rest_at(self, position: mi.Point2f) -> mi.Bool:
-        """Return whether the camera ray through a film position may move: see `FilmFlow`.
-
-        The camera is static, so its rays move only with their film positions. The result therefore equals `moves_at`.
-        """
-        return self.moves_at(position)
+    leaves_rest_at = moves_at  # the camera is static, so its rays move only with their film positions
 
     def carry_tangents(self) -> None:
         with dr.resume_grad():
