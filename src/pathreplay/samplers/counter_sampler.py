@@ -50,7 +50,7 @@ class CounterSampler:
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
         x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # the two halves of a cipher block
         self.index += 2  # a 2D sample uses two indices, and a vertex uses six (see `at_vertex`)
-        return mi.Point2f(_in_unit(x), _in_unit(y))
+        return mi.Point2f(in_unit(x), in_unit(y))
 
 
 def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
@@ -70,9 +70,9 @@ def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32, dimensions: int = 2) -> 
     steps = [dr.opaque(mi.UInt32, 2**32 // n % 2**32), *map(mi.UInt32, STEPS)][:dimensions]
     shifts = [mi.sample_tea_32(seed, mi.UInt32(k + 1), ROUNDS)[0] for k in range(dimensions)]
     first, *rest = [i * step + shift for step, shift in zip(steps, shifts, strict=True)]
-    return [mi.Float64(first) * 2**-32, *map(_in_unit, rest)]
+    return [mi.Float64(first) * 2**-32, *map(in_unit, rest)]
 
 
-def _in_unit(x: mi.UInt32) -> mi.Float:
+def in_unit(x: mi.UInt32) -> mi.Float:
     """Map a 32-bit integer to a float in [0, 1)."""
     return mi.Float(x >> 8) * 2**-24

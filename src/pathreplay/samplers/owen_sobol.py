@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.counter_sampler import in_unit
+
 _GOLDEN = 0x9E3779B9
 
 
@@ -36,11 +38,11 @@ class OwenSobolSampler:
 
     def next_1d(self, active: bool | mi.Bool = True) -> mi.Float:
         key, x = self._next()
-        return _unit(_scrambled(x, key * 0x85EBCA6B))
+        return in_unit(_scrambled(x, key * 0x85EBCA6B))
 
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
         key, x = self._next()
-        return mi.Point2f(_unit(_scrambled(x, key * 0x85EBCA6B)), _unit(_scrambled(_second(x), key * 0xC2B2AE35)))
+        return mi.Point2f(in_unit(_scrambled(x, key * 0x85EBCA6B)), in_unit(_scrambled(_second(x), key * 0xC2B2AE35)))
 
     def _next(self) -> tuple[mi.UInt32, mi.UInt32]:
         """Return the key of the next dimension, and the bit-reversed path index after it was shuffled with this key."""
@@ -97,7 +99,3 @@ def _spread(x: mi.UInt32) -> mi.UInt32:
     for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
         x = (x | (x << shift)) & mask
     return x
-
-
-def _unit(x: mi.UInt32) -> mi.Float:
-    return mi.Float(x >> 8) * 2**-24
