@@ -44,8 +44,14 @@ def knobs(directions: np.ndarray) -> np.ndarray:
     return points / np.ptp(points, axis=0).max()
 
 
-def mesh(vertices: np.ndarray, faces: np.ndarray, bsdf: dict[str, object], flat: bool = False) -> mi.Mesh:
+def mesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    bsdf: dict[str, object],
+    flat: bool = False,
+    texcoords: np.ndarray | None = None,
+) -> mi.Mesh:
     """Create a Mitsuba mesh, with vertex normals unless it is ``flat``."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
-    return compat.new_mesh(vertices, faces, props, flat)
+    return compat.new_mesh(vertices, faces, props, flat, texcoords)

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
-from pathreplay.platform import compat
 from pathreplay.scenes.bodies import mesh
 from pathreplay.types import SceneDict
 
@@ -256,7 +255,4 @@ def _mesh(vertices: Array, faces: NDArray[np.integer], width: float, high: float
 
     ``width`` is the width of the map, and ``high`` its height divided by its width.
     """
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(bsdf)
-    texcoords = vertices[:, :2] / np.array([width, width * high]) + 0.5
-    return compat.new_mesh(vertices, faces, props, flat=False, texcoords=texcoords)
+    return mesh(vertices, faces, bsdf, texcoords=vertices[:, :2] / np.array([width, width * high]) + 0.5)
