@@ -165,6 +165,21 @@ def test_an_album_tells_of_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
         DiskStore(room=0).keep(array(300, 200, 3))
 
 
+def test_a_disk_store_needs_no_tmpdir(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", "/nowhere")
+    picture = array(300, 200, 3)
+    np.testing.assert_array_equal(DiskStore(room=0).keep(picture), picture)
+
+
+def test_a_disk_store_tells_that_no_folder_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    def read_only(*arguments: Any, **options: Any) -> Any:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("tempfile.TemporaryFile", read_only)
+    with pytest.raises(PathreplayError, match=r"cannot be kept on disk \(Read-only.*\); set TMPDIR to a folder"):
+        DiskStore(room=0).keep(array(300, 200, 3))
+
+
 def test_tensor_files_are_those_of_the_library() -> None:
     arrays = {"b:x": array(3, 4), "a": array(1)[0:0], "n": np.float64([1, 2]), "i": np.arange(3, dtype=np.uint32)}
     asked: list[str] = []

@@ -266,6 +266,15 @@ XML = """<scene version="3.0.0">
 </scene>"""
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_bitmaps_of_integers_are_decoded(kind: type[np.unsignedinteger]) -> None:
+    bitmap = mi.Bitmap(np.full((SIDE, SIDE, 3), np.iinfo(kind).max // 2, kind))
+    before = bitmap.srgb_gamma()
+    view = Problem(room(), {WALL: GREY}, View(0, bitmap)).built.views[0]
+    np.testing.assert_allclose(view.target, 0.5**2.2, rtol=0.05)
+    assert bitmap.srgb_gamma() == before
+
+
 def test_scenes_are_objects_dictionaries_files_and_names(photos: list[np.ndarray], tmp_path: Path) -> None:
     """A dictionary is given twice: it keeps its tensors."""
     (tmp_path / "room.xml").write_text(XML)

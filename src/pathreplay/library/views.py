@@ -86,9 +86,10 @@ def _pixels(what: str, value: object, *, stored: bool = False) -> Image:
 def _floats(bitmap: mi.Bitmap, stored: bool) -> mi.Bitmap:
     """Convert a bitmap to floats; for ``stored`` see `_pixels`. Bitmaps of PNG files have straight alpha."""
     transform = mi.Bitmap.AlphaTransform.Empty
-    if stored:
+    # Mitsuba marks bitmaps of 16-bit files as sRGB, but not those of 16-bit arrays.
+    if stored or bitmap.component_format() == mi.Struct.Type.UInt16:
         bitmap = mi.Bitmap(bitmap)
-        bitmap.set_srgb_gamma(False)
-    elif bitmap.has_alpha() and not bitmap.premultiplied_alpha():
+        bitmap.set_srgb_gamma(not stored)
+    if not stored and bitmap.has_alpha() and not bitmap.premultiplied_alpha():
         transform = mi.Bitmap.AlphaTransform.Premultiply
     return bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False, alpha_transform=transform)

@@ -11,7 +11,6 @@ import os
 import tempfile
 import weakref
 from collections import deque
-from pathlib import Path
 from typing import IO
 
 import numpy as np
@@ -28,7 +27,9 @@ Array = NDArray[np.float32]
 
 
 class DiskStore:
-    """Keeps up to ``room`` bytes of arrays in memory, and other arrays in a file in TMPDIR (default: /var/tmp).
+    """Keeps up to ``room`` bytes of arrays in memory, and other arrays in a file in a folder on disk.
+
+    The folder is TMPDIR or /var/tmp, or the system's folder of temporary files if neither can be written.
 
     Arrays that nobody uses any more give their memory budget and their part of the file back.
     """
@@ -51,7 +52,7 @@ class DiskStore:
     def keep(self, array: Array) -> Array:
         """Return the array itself if it fits into memory, or a read-only copy on disk.
 
-        Raises PathreplayError if the disk is full.
+        Raises PathreplayError if the disk is full, or the file cannot be written.
         """
         if array.nbytes <= SMALL or array.nbytes <= self.room:
             self._room -= array.nbytes
@@ -68,11 +69,14 @@ class DiskStore:
             self._file.flush()
         except OSError as error:
             self._unmapped.append((begin, end))
+            size = f"{(begin + array.nbytes) / 1e9:.2g} GB of images and initial values"
             if error.errno not in (errno.ENOSPC, errno.EDQUOT, None):
-                raise
+                raise PathreplayError(
+                    f"{size} cannot be kept on disk ({error.strerror}); set TMPDIR to a folder that can be written"
+                ) from error
             raise PathreplayError(
-                f"No space left in {_folder()} for {(begin + array.nbytes) / 1e9:.2g} GB of images and initial values "
-                "that are kept on disk; free some space, or set TMPDIR to a folder on another disk"
+                f"No space left in {_folder()} for {size} that are kept on disk; free some space, or set TMPDIR to a "
+                "folder on another disk"
             ) from error
         pages = mmap.mmap(self._file.fileno(), array.nbytes, access=mmap.ACCESS_READ, offset=begin)
         self._maps.add(pages)
@@ -116,4 +120,7 @@ class DiskStore:
 
 def _folder() -> str:
     """Return the folder of the file. /var/tmp is preferred to /tmp, which is in memory on some machines."""
-    return os.environ.get("TMPDIR") or ("/var/tmp" if Path("/var/tmp").is_dir() else tempfile.gettempdir())
+    for folder in (os.environ.get("TMPDIR"), "/var/tmp"):
+        if folder and os.path.isdir(folder) and os.access(folder, os.W_OK | os.X_OK):
+            return folder
+    return tempfile.gettempdir()
