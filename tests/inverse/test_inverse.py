@@ -120,6 +120,15 @@ def test_config_of_the_example_is_valid() -> None:
 MINIMAL = {"scene": "cornell-box", "parameters": [{"key": "a"}], "target": {"images": ["t.exr"]}}
 BAD_CONFIGS = {
     "unknown key": ({"iteration": 3}, "unknown key 'iteration'; did you mean 'iterations'?"),
+    "an unknown key with the name of a type": ({"count": 3}, "unknown key 'count'; "),
+    "an unknown key of a table with the name of a type": (
+        {"parameters": [{"key": "a", "float": 3}]},
+        "unknown key 'parameters.0.float'; ",
+    ),
+    "no import path": (
+        {"parameters": [{"key": "a", "regularizer": "own"}]},
+        "'parameters.0.regularizer': 'own' is not an import path; write module:function",
+    ),
     "a key of the library": ({"steps": 3}, "unknown key 'steps'; did you mean 'iterations'?"),
     "bounds as in the library": (
         {"parameters": [{"key": "a", "bounds": [0, 1]}]},

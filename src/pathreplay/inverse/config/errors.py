@@ -92,7 +92,8 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
     first = next((e for e in details if e["type"] == "extra_forbidden"), details[0])
     where = ".".join(_path(first["loc"])) or "the job"
     if first["type"] == "extra_forbidden":
-        key = str(first["loc"][-1])
+        key = str(first["loc"][-1])  # which may be one of `_ALTERNATIVES`
+        where = ".".join([*_path(first["loc"][:-1]), key])
         table = next((tables[str(part)] for part in reversed(first["loc"][:-1]) if part in tables), job)
         new = next((name for name in RENAMED.get(key, "").split() if name in table.model_fields), None)
         if new is not None:
@@ -104,6 +105,8 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
         reason = str(first["ctx"]["error"])
         # Messages about tables already name the table. Messages about numbers lack the key, which is added here.
         return f"'{where}': {reason}" if isinstance(first["input"], Real) else reason
+    if first["type"] == "import_path":
+        return f"'{where}': {first['msg']}"
     # If several alternatives failed, describe all types that the key accepts.
     kinds = next((kinds for key, kinds in _KINDS.items() if key in _path(first["loc"])), None)
     if kinds is not None and len(details) > 1:

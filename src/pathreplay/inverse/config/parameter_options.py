@@ -6,6 +6,7 @@ import difflib
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+from pydantic_core import PydanticCustomError
 
 from pathreplay.errors import shown
 from pathreplay.inverse.config.tables import Count, Finite, Positive, Switch, Table
@@ -30,7 +31,9 @@ Value = Finite | list[Finite] | str | ImageValue
 def _import_path(value: str) -> str:
     module, _, function = value.partition(":")
     if not module or not function or ":" in function:
-        raise ValueError(f"{shown(value)} is not an import path; write module:function")
+        raise PydanticCustomError(
+            "import_path", "{name} is not an import path; write module:function", {"name": shown(value)}
+        )
     return value
 
 
