@@ -215,6 +215,16 @@ def test_prepared_images_are_those_of_a_pinhole(tmp_path: Path) -> None:
     assert np.abs(prepared.image - expected)[inside].max() < 0.03
 
 
+@pytest.mark.parametrize(("channels", "words"), [(5, "has 5 channels, but a photo has 3"), (3, "NaN or infinite")])
+def test_photos_that_are_none_are_told(channels: int, words: str, tmp_path: Path) -> None:
+    image = np.ones((16, 16, channels), np.float32)
+    image[0, 0, 0] = 1 if channels > 3 else np.nan
+    mi.Bitmap(image).write(str(tmp_path / "a.exr"))
+    photo = Photo("a", "a.exr", tmp_path / "a.exr", None, Lens(16, 16, 16.0, 16.0, 8.0, 8.0), np.eye(4))
+    with pytest.raises(PathreplayError, match=words):
+        prepare(photo, frames_of([photo], 16)[0])
+
+
 def test_stages_fit_into_the_time() -> None:
     speed = Speed(samples=1e6, tracing=0.05, compiling=1.0)
     plan = plan_stages(speed, 30, 40, 160, 280, "job.toml")

@@ -23,6 +23,7 @@ from pathreplay.inverse.images.io import (
     transparent_share,
     with_channels,
 )
+from pathreplay.inverse.parameters.values import adapted_image
 from pathreplay.types import Json
 
 PIXELS = 46_000
@@ -116,11 +117,13 @@ def frames_of(photos: Sequence[Photo], width: int | None) -> list[Frame]:
 
 
 def prepare(photo: Photo, frame: Frame) -> Prepared:
-    """Read a photo and resample it to the camera of ``frame``. Raises PathreplayError if it cannot be read."""
+    """Read a photo and resample it to the camera of ``frame``.
+
+    Raises PathreplayError if the photo cannot be read, is not finite, or has an unsupported number of channels.
+    """
     image = read_image(photo.image)
     transparent = transparent_share(image) > 0
-    colours = with_channels(over_black(image, photo.image), 3)
-    assert colours is not None
+    colours = adapted_image(f"Image {photo.image}", over_black(image, photo.image), "a photo has", 3)
     counts = np.ones((*colours.shape[:2], 1), np.float32)
     if photo.mask is not None:
         counts = _mask(photo, colours.shape[:2])
