@@ -203,6 +203,15 @@ def test_vertices_of_a_mesh_from_a_file_come_out(many: Path, tmp_path: Path) -> 
     assert "meshes/wedge.ply" in found.files and not found.copies
 
 
+def test_a_file_with_the_name_of_a_written_mesh_is_copied(many: Path, tmp_path: Path) -> None:
+    other = '<shape type="ply" id="other"><string name="filename" value="meshes/wedge.ply"/></shape>'
+    many.write_text(MANY.replace("</scene>", f"{other}</scene>"))
+    moved = get_array(mi.traverse(mi.load_file(str(many), optimize=False))["wedge.vertex_positions"]) * 1.3
+    found = exported(Source(many, {}, {}, {}), {"wedge.vertex_positions": moved})
+    assert "meshes/wedge.ply" in found.files and list(found.copies) == ["files/wedge.ply"]
+    same_pictures(found, tmp_path / "out")
+
+
 def test_what_nobody_knows_the_making_of_is_told(tmp_path: Path) -> None:
     scene = mi.cornell_box()
     scene["floor"]["bsdf"] = mi.load_dict({"type": "roughplastic"})
@@ -342,6 +351,20 @@ def test_the_cameras_of_a_run_can_be_read_as_a_capture(run: Path) -> None:
         ours, theirs = (mi.traverse(each) for each in (sensor, camera))
         for key in ("to_world", "x_fov"):
             np.testing.assert_allclose(get_array(theirs[key]), get_array(ours[key]), atol=1e-5)
+
+
+@pytest.mark.parametrize("in_python", [False, True])
+def test_a_run_without_a_result_is_resumed_where_it_was_started(in_python: bool, run: Path, tmp_path: Path) -> None:
+    folder = run.rename(tmp_path / "a run")
+    (folder / "parameters.safetensors").unlink()
+    origin = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps({**origin, "in_python": in_python}))
+    command = f"pathreplay optimize --resume '{folder}'"
+    if in_python:
+        command = f"pathreplay.minimize(problem, output='{folder}', resume=True)"
+    with pytest.raises(PathreplayError) as told:
+        export_run(folder)
+    assert str(told.value).endswith(f"resume with: {command}")
 
 
 @pytest.mark.parametrize("trouble", ["no run", "no result", "a result that is none", "no scene", "a full folder"])

@@ -8,8 +8,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.output.surface_scene import emitting_mesh, surface_xml
+from pathreplay.errors import PathreplayError
+from pathreplay.jobs import make_config
+from pathreplay.output.surface_scene import _placed, emitting_mesh, surface_xml
 from pathreplay.output.surfaces import surface
+from pathreplay.runs.run_folder import Job
 
 N = 24
 
@@ -41,6 +44,14 @@ def test_surface_is_closed_where_the_grid_ends() -> None:
 def test_nothing_above_the_level() -> None:
     points, triangles = surface(np.zeros((3, 3, 3)), 0.5)
     assert len(points) == len(triangles) == 0
+
+
+def test_a_scene_with_two_media_is_told(tmp_path: Path) -> None:
+    job = {"scene": "room.xml", "parameters": [{"key": "a"}], "target": {"images": ["a.exr"]}}
+    shape = '<shape type="sphere"><medium type="homogeneous" name="interior"/></shape>'
+    (tmp_path / "room.xml").write_text(f'<scene version="3.0.0">{2 * shape}</scene>')
+    with pytest.raises(PathreplayError, match=r"has 2 shapes .* of exactly one; .* with: pathreplay export 'a run'"):
+        _placed(Path("a run"), Job(make_config(job), None, tmp_path))
 
 
 def test_mitsuba_renders_the_radiance(tmp_path: Path) -> None:

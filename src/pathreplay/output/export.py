@@ -28,9 +28,9 @@ from pathreplay.platform import backend, compat
 from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.platform.files import file_names
 from pathreplay.platform.traversal import traversed
-from pathreplay.runs.run_folder import IN_MEMORY, Job, read_job, require_writable_name
+from pathreplay.runs.run_folder import IN_MEMORY, Job, read_job, require_writable_name, resume_command
 from pathreplay.scenes.builtin import BUILTINS
-from pathreplay.scenes.descriptions import errors_as
+from pathreplay.scenes.descriptions import errors_as, load_integrator
 from pathreplay.scenes.loading import as_xml_has_them, builtin_dict, coarse_pictures
 from pathreplay.scenes.parameters import get_array
 from pathreplay.types import Json
@@ -62,12 +62,11 @@ def export_run(run: Path, output: Path | None = None) -> str:
     require_writable_name(folder, _OPTION)
     job = read_job(run)
     backend.set_variant(job.config.variant)
-    values = run_result(run)
+    values = run_result(run, job.in_python)
     source = _source(job, values)
     photographic = {key: values.pop(key) for key in (EXPOSURE, RESPONSE) if key in values}
     free = {entry.key: values.pop(entry.key) for entry in job.config.parameters if entry.shape is not None}
-    given = "integrator" in job.config.model_fields_set
-    export = exported(source, values, job.config.integrator.model_dump() if given else None)
+    export = exported(source, values, _integrator(job))
     with whole_folder(folder, _OPTION) as part:
         write_files(export, part)
         for name, data in _beside(export, values | photographic, free).items():
@@ -95,13 +94,16 @@ def write_files(export: Exported, folder: Path) -> None:
             raise PathreplayError(f"File {path} of the scene cannot be copied ({error.strerror})") from error
 
 
-def run_result(run: Path) -> dict[str, np.ndarray]:
-    """Return the decoded parameter values at the end of a run. Raises PathreplayError if the run has no result."""
+def run_result(run: Path, in_python: bool) -> dict[str, np.ndarray]:
+    """Return the decoded parameter values at the end of a run.
+
+    ``in_python`` says whether the job has Python objects. Raises PathreplayError if the run has no result.
+    """
     path = run / "parameters.safetensors"
     if not path.is_file():
         raise PathreplayError(
             f"Run {run} has no result yet (no {path.name}); end it with Ctrl-C, which writes the result, or resume "
-            f"with: pathreplay optimize --resume {run}"
+            f"with: {resume_command(run, in_python)}"
         )
     try:
         values = safetensors.numpy.load_file(str(path))
@@ -129,6 +131,19 @@ def _source(job: Job, values: Arrays) -> Source:
         raise PathreplayError(f"Scene {path} of the run no longer exists; restore it")
     source = Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras, medium=medium)
     return replace(source, floats=_floats(source, values))
+
+
+def _integrator(job: Job) -> Json | None:
+    """Return the integrator of a job, or None to use that of the scene."""
+    options = job.config.integrator.model_dump()
+    if "integrator" not in job.config.model_fields_set:
+        return None
+    if job.in_python:
+        try:
+            load_integrator(options)
+        except PathreplayError:  # the integrator was an object, of which the config has only the name of the class
+            return None
+    return options
 
 
 def _floats(source: Source, values: Arrays) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 import mitsuba as mi
@@ -47,6 +48,8 @@ class Placing:
         self.described, self.scene, self.names = described, scene, names
         self.params = traversed(scene)
         self.files: dict[str, bytes] = {}
+        self.owners: set[int] = set()
+        """Ids of the nodes whose files are in ``files``."""
         self._meshes: dict[str, str] = {}
 
     def put(self, key: str, owner: Owner) -> None:
@@ -104,6 +107,7 @@ class Placing:
         _remove(node.props, *_MADE_BY, "to_world")
         node.props.set_plugin_name("ply")
         node.props["filename"] = self._ply(mesh, node.props.id())
+        self.owners.add(id(node))
 
     def _ply(self, mesh: mi.Mesh, name: str) -> str:
         """Add the PLY file of a mesh, unless it was added before, and return the file's name."""
@@ -128,6 +132,7 @@ class Placing:
                 properties[part] = self.described.add(self._known(instance, f"{part} of '{name}'"), kind)
         _remove(parent.props, name)
         parent.props[name] = self.described.add(properties, mi.ObjectType.Shape)
+        self.owners.add(id(self.described.nodes[-1]))
 
     def _known(self, instance: mi.Object, what: str) -> mi.Properties:
         """Describe a loaded material or emitter by properties.
@@ -182,6 +187,7 @@ class Placing:
     def _from_file(self, node: Node, name: str, data: bytes) -> None:
         _remove(node.props, *_MADE_BY)
         node.props["filename"] = name
+        self.owners.add(id(node))
         self.files[name] = data
 
 
@@ -203,15 +209,16 @@ def made_otherwise(node: Node) -> bool:
     return any(name in node.props for name in ("bitmap", "grid", "data"))
 
 
-def copied_files(described: Described, placed: dict[str, bytes]) -> dict[str, Path]:
-    """Return the paths of the files that the scene references, by new name. Files in ``placed`` are omitted.
+def copied_files(described: Described, placed: Collection[int]) -> dict[str, Path]:
+    """Return the paths of the files that the scene references, by new name.
 
-    The new names replace the old names in the description.
+    Nodes whose id is in ``placed`` are omitted: their files have been written. The new names replace the old names in
+    the description.
     """
     copies: dict[str, Path] = {}
     for node in described.nodes:
         name = node.props.get("filename", None)
-        if not isinstance(name, str) or name in placed:
+        if not isinstance(name, str) or id(node) in placed:
             continue
         path = described.find_file(name).resolve()
         new_name = next((new for new, old in copies.items() if old == path), None)

@@ -120,7 +120,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
     placing.meshes()
     notes = _plain_plugins(described) + _plain_integrator(described, integrator)
     require_no_objects(described)
-    copies = copied_files(described, placing.files)
+    copies = copied_files(described, placing.owners)
     files = {**placing.files, SCENE: scene_xml(described, not isinstance(source.scene, Mapping))}
     return Exported(scene, files, copies, tuple(notes))
 

@@ -56,13 +56,13 @@ def export_surface(run: Path, output: Path | None = None) -> str:
     require_writable_name(folder, "-o")
     job = read_job(run)
     backend.set_variant(job.config.variant)
-    values = run_result(run)
+    values = run_result(run, job.in_python)
     density, radiance = (
         next((value for key, value in values.items() if key.endswith(ending)), None) for ending in (DENSITY, RADIANCE)
     )
     if density is None or radiance is None:
         raise PathreplayError(f"Run {run} recovered no density grid with a radiance; use pathreplay export")
-    low, size = _placed(job)
+    low, size = _placed(run, job)
     cameras = _cameras(job)
     views = _compared(run, cameras)
     tried = THICKNESSES if views else THICKNESSES[:1]
@@ -88,12 +88,15 @@ def export_surface(run: Path, output: Path | None = None) -> str:
     )
 
 
-def _placed(job: Job) -> tuple[np.ndarray, np.ndarray]:
+def _placed(run: Path, job: Job) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower corner and the size of the box of the medium."""
     scene = load_scene(job.config.scene, job.base, **job.config.scene_parameters)
     boxes = [shape.bbox() for shape in scene.shapes() if shape.interior_medium() is not None]
     if len(boxes) != 1:
-        raise PathreplayError(f"Scene {job.config.scene} has {len(boxes)} shapes with a medium; export one of them")
+        raise PathreplayError(
+            f"Scene {job.config.scene} has {len(boxes)} shapes with a medium, but a surface is made of exactly one; "
+            f"write the whole scene with: pathreplay export {shlex.quote(str(run))}"
+        )
     return np.array(boxes[0].min, np.float64).ravel(), np.array(boxes[0].extents(), np.float64).ravel()
 
 
