@@ -471,6 +471,12 @@ def test_a_callback_ends_it_and_nothing_is_written(photos: list[np.ndarray], tmp
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_complete_run_is_not_stopped(photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY}, views(photos), spp=1)
+    result = pathreplay.minimize(problem, steps=2, progress=False, callbacks=lambda it: it.number == 1)
+    assert (result.stopped, len(result.history)) == (None, 2)
+
+
 def test_a_callback_may_stand_alone_and_compare_arrays(photos: list[np.ndarray]) -> None:
     """The comparison returns a boolean of NumPy. Other results do not end the run."""
     problem = Problem(room(), {WALL: GREY}, views(photos))

@@ -192,7 +192,8 @@ def _minimized(
                 found = with_scene(built, ended(built, run).values)
             put_values(built, {v.key: found[v.key] for v in built.variables})
     folder = None if kept is None else kept.folder.path
-    return Result(found, run.history, stop.by or run.optimiser.finished or None, problem, folder)
+    stopped = run.optimiser.finished or (stop.by if len(run.history) < built.config.iterations else None)
+    return Result(found, run.history, stopped, problem, folder)
 
 
 def _is_true(value: object) -> bool:
