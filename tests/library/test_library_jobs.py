@@ -16,6 +16,7 @@ import pathreplay
 from pathreplay import Parameter, PathreplayError, View, load_job
 from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.jobs import iterate, optimize
+from pathreplay.output.export import export_run
 from room_job import CLOUD
 from small_job import checkpoint_bits
 from variant import VARIANT
@@ -158,6 +159,32 @@ def test_captures_of_several_jobs_are_joint(place: Path) -> None:
     result = pathreplay.minimize(pathreplay.Problem.joint(captures), steps=2, progress=False, output="run")
     assert [view.target.max() for view in result.problem.built.views] == [np.float32(0.2), np.float32(0.4)]
     assert len(result.history) == 2
+
+
+@pytest.mark.parametrize("kind", ["object", "dictionary"])
+def test_cameras_of_a_capture_are_not_added_to_a_scene_in_memory(kind: str, place: Path) -> None:
+    camera = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+    (place / "photo.exr").write_bytes(exr_bytes(np.full((4, 6, 3), 0.2, np.float32)))
+    frames = [{"file_path": "photo.exr", "transform_matrix": camera}]
+    (place / "capture.json").write_text(json.dumps({"camera_angle_x": 0.6, "frames": frames}))
+    job = {key: value for key, value in JOB.items() if key not in ("target", "sensors")}
+    path = written(place, {**job, "capture": {"transforms": "capture.json"}})
+    wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
+    scene: Any = {"type": "scene", "wall": wall}
+    if kind == "object":
+        scene = mi.load_file(str(place / "room.xml"))
+    with pytest.raises(PathreplayError, match=r"scene: cameras of a capture .* give the name of a file, or 'views'"):
+        load_job(path, scene=scene)
+    known = load_job(path).scene  # it has the camera
+    assert load_job(path, scene=known).scene is known
+
+
+def test_a_run_with_an_integrator_object_is_exported(place: Path) -> None:
+    prb = mi.load_dict({"type": "prb", "max_depth": 2})
+    problem = load_job(written(place, {**JOB, "iterations": 1}), integrator=prb)
+    pathreplay.minimize(problem, output="run", progress=False)
+    export_run(Path("run"))
+    mi.load_file("run/export/scene.xml")
 
 
 @pytest.mark.parametrize(

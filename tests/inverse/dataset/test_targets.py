@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import PIL.Image
@@ -13,12 +14,15 @@ import pytest
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.globbing import matching
+from pathreplay.inverse.dataset.views import sensors_of, shares_of
 from pathreplay.inverse.images.io import encoded, exposure_for, exr_bytes, over_black, png_bytes, read_image
 from pathreplay.inverse.problem.problem import InMemory, Problem, build_problem
 from pathreplay.jobs import make_config
+from pathreplay.platform.threads import spare_thread
 
 WIDTH, HEIGHT = 6, 4
 SKY = [0.2, 0.4, 0.6]
+SENSOR = {"type": "perspective", "fov": 40}
 
 
 def scene(film: str = "rgb") -> str:
@@ -137,6 +141,16 @@ def test_a_pattern_gives_a_picture_to_each_view(folder: Path) -> None:
         assert words in str(told.value) and "\n" not in str(told.value)
 
 
+def test_sensors_are_integers_of_numpy_or_decimal_text() -> None:
+    """The keys of a table are text."""
+    known = mi.load_string(scene())
+    assert sensors_of(known, [np.int64(0)]) == sensors_of(known, ["0"]) == {"eye": 0}
+    assert shares_of(known, {"eye": 0}, {"0": 2.0}, set()) == {"eye": 1.0}
+    assert sensors_of(mi.load_dict({"type": "scene", "1": SENSOR, "b": {**SENSOR, "fov": 50}}), ["1"]) == {"1": 0}
+    with pytest.raises(PathreplayError, match="No sensor '1' in the scene"):
+        sensors_of(known, ["1"])
+
+
 # ------------------------------------------------------------------------------
 #  Alpha
 # ------------------------------------------------------------------------------
@@ -168,6 +182,23 @@ def test_alpha_is_composited_over_what_the_scene_has_behind(ending: str, folder:
     integrator = mi.load_dict({"type": "pathreplay", "hide_emitters": True})
     given = build_problem(make_config({**job, "target": target}), Path(), memory=InMemory(integrator=integrator))
     assert (given.views[0].target == hidden.views[0].target).all(), "an object has the options of a table"
+
+
+def test_the_background_of_a_deterministic_job_is_rendered_by_one_thread(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts = []
+
+    def counted(scene: mi.Scene, sensor: int) -> np.ndarray:
+        counts.append(dr.thread_count())
+        return np.zeros((HEIGHT, WIDTH, 3), np.float32)
+
+    monkeypatch.setattr("pathreplay.inverse.dataset.targets.background", counted)
+    half_transparent(folder, "exr")
+    with spare_thread():
+        for deterministic in (False, True):
+            problem_of({"images": ["picture.exr"], "alpha": "scene"}, deterministic=deterministic)
+    assert counts[0] > counts[1] == 1
 
 
 @pytest.mark.parametrize("ending", ["exr", "png"])

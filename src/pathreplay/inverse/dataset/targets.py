@@ -35,6 +35,7 @@ from pathreplay.inverse.images.io import (
 )
 from pathreplay.inverse.parameters.grids import comparable
 from pathreplay.inverse.parameters.values import Array, adapted_image, make_value, require_finite_array, seen
+from pathreplay.platform.threads import one_thread
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import errors_as, load_integrator
@@ -135,6 +136,8 @@ class Reading:
     """Whether images are resampled to the size of the film."""
     lenses: Mapping[str, Lens] = field(default_factory=dict)
     """Lens distortions to remove, by view."""
+    deterministic: bool = False
+    """Whether backgrounds are rendered by a single thread, so that they are reproducible."""
 
 
 def read_targets(
@@ -181,7 +184,9 @@ def read_targets(
             weights[name] = as_weight(f"the alpha of '{file}'", opaque, name)
             image = unpremultiplied(image)
         elif alpha == "scene" and not how.hidden:
-            image = over(image, background(scene, sensors[name]))
+            with one_thread(how.deterministic):
+                behind = background(scene, sensors[name])
+            image = over(image, behind)
         targets[name] = disk.keep(adapted_image(what, image, f"sensor '{name}' renders", shape[2]))
         if name in weights:
             weights[name] = disk.keep(weights[name])

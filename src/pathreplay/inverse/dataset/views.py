@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 
 import mitsuba as mi
 import numpy as np
@@ -63,6 +64,8 @@ def sensors_of(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int
 def _place(item: int | str, ids: list[str], names: list[str]) -> int:
     """Return the index of the sensor ``item``, which is an id, a name or an index."""
     index = next((known.index(item) for known in (ids, names) if item in known), item)
+    if isinstance(index, Integral) or (isinstance(index, str) and index.isdecimal()):  # keys of tables are text
+        index = int(index)
     if not isinstance(index, int) or not 0 <= index < len(names):
         raise PathreplayError(
             f"No sensor {shown(item)} in the scene; it has {', '.join(names)} (0 to {len(names) - 1})"

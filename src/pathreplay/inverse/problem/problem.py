@@ -344,6 +344,11 @@ def _loaded(
 ) -> tuple[mi.Scene, Config, tuple[str, ...]]:
     """Load the scene and fill in default integrators. Returns scene, completed job, and notes for the user."""
     if given.scene is not None:
+        if shots and not set(shots) & {sensor.id() for sensor in given.scene.sensors()}:
+            raise PathreplayError(
+                "scene: cameras of a capture are only added to the scene file of a job, and this scene is an object; "
+                "give the name of a file, or 'views' in place of the capture"
+            )
         config, differences = completed(config, given.scene, given.integrator)
         return given.scene, config, differences
     wanted = [entry.key for entry in config.parameters if entry.shape is None]
@@ -431,7 +436,8 @@ def _pictures(
 ) -> tuple[Targets, tuple[str, ...]]:
     """Read the targets from the files of a capture or of the job. Returns targets, and notes for the user."""
     scene, sensors = opened.scene, opened.sensors
-    how = Reading(config.target.alpha, hidden=bool(getattr(opened.integrator, "hide_emitters", False)))
+    hidden = bool(getattr(opened.integrator, "hide_emitters", False))
+    how = Reading(config.target.alpha, hidden=hidden, deterministic=config.deterministic)
     if config.capture is None:
         files = by_view("target images", config.target.images or [], sensors, base)
         return read_targets(files, how, scene, sensors, base, disk)
