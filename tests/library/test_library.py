@@ -710,8 +710,20 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
     with pytest.raises(PathreplayError, match=r"has the shape \(4, 4\), not the shape \(4, 4, 3\)"):
         textured.render({TEXTURE: np.zeros((4, 4))})
     assert textured.render({TEXTURE: np.zeros((8, 8, 3))}, spp=1).shape == (SIDE, SIDE, 3)
-    with pytest.raises(PathreplayError, match="'iterations' is 0"):
+    with pytest.raises(PathreplayError, match="minimize: 'steps' is 0"):
         pathreplay.minimize(problem, steps=0, progress=False)
+    stages = [{"iterations": 5}]
+    with pytest.raises(PathreplayError, match="steps is 50, but the stages have 5 in total; remove 'steps'"):
+        pathreplay.minimize(problem, steps=50, stages=stages, progress=False)
+    with pytest.raises(
+        PathreplayError, match="warmup_steps = 9 is not less than steps = 5; lower it, or raise 'steps'"
+    ):
+        pathreplay.minimize(problem, steps=5, warmup_steps=9, progress=False)
+    refined = Problem(room(), {TEXTURE: Parameter(resolutions=[4, 8], refine_at=[6])}, views(photos))
+    with pytest.raises(
+        PathreplayError, match="refine_at 6 is not less than steps = 5; refine earlier, or raise 'steps'"
+    ):
+        pathreplay.minimize(refined, steps=5, progress=False)
     compared = Problem(room(), {WALL: GREY}, views(photos), baseline={"type": "prb"})
     with pytest.raises(PathreplayError, match="optimizer: an object cannot step the baseline as well"):
         pathreplay.minimize(compared, mi.ad.Adam(lr=0.1), steps=1, progress=False)

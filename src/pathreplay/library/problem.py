@@ -240,9 +240,8 @@ class Problem:
         if fixed := sorted(OF_A_PROBLEM & set(changes)):
             raise PathreplayError(f"{name}: '{fixed[0]}' belongs to the problem; give it to Problem")
         job = {key: value for key, value in self.job.items() if key != "iterations" or "stages" not in changes}
-        checked = make_config({**job, **changes}, name)
+        checked = make_config({**job, **changes}, name, {"iterations": "steps"})
         config = self.built.config.model_copy(update={key: getattr(checked, key) for key in {*changes, "iterations"}})
-        config.model_fields_set.update(changes)
         config.__dict__["learning_rate_schedule"] = checked.learning_rate_schedule
         built = replace(self.built, config=config)
         if isinstance(built, inner_joint.JointProblem):

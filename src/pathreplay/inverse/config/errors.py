@@ -79,18 +79,22 @@ _WITH_OWN_KEYS = ("target", "parameters", "capture")
 """Tables whose keys are recognised at the top of a job."""
 
 
-def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[str, type[BaseModel]]) -> str:
+def first_error(
+    error: ValidationError, job: type[BaseModel], tables: Mapping[str, type[BaseModel]], names: Mapping[str, str]
+) -> str:
     """Describe one error of a job in a single line: location, value and remedy. An unknown key has precedence.
 
     Args:
         error: pydantic's error for a whole job.
         job: model of the job.
         tables: models of the tables that a job may contain, by key.
+        names: other names of keys of the job.
     """
     details = error.errors()
     # A value of a union type yields one error per alternative. An unknown key is the most informative of these errors.
     first = next((e for e in details if e["type"] == "extra_forbidden"), details[0])
     where = ".".join(_path(first["loc"])) or "the job"
+    where = names.get(where, where)
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])  # which may be one of `_ALTERNATIVES`
         where = ".".join([*_path(first["loc"][:-1]), key])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import difflib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import prod
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, model_validator
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.definitions import defined
@@ -172,7 +172,7 @@ class Config(Table):
         )
 
     @model_validator(mode="after")
-    def _in_stages(self) -> Config:
+    def _in_stages(self, info: ValidationInfo) -> Config:
         total = begins(self.stages or [])[-1]
         if self.stages is not None:
             if "iterations" not in self.model_fields_set:
@@ -180,9 +180,8 @@ class Config(Table):
                 # saved.
                 self.__dict__["iterations"] = total
             elif self.iterations != total:
-                raise ValueError(
-                    f"iterations is {self.iterations}, but the stages have {total} in total; remove 'iterations'"
-                )
+                name = _name_of_iterations(info)
+                raise ValueError(f"{name} is {self.iterations}, but the stages have {total} in total; remove '{name}'")
         for entry in self.parameters:
             sizes = len(entry.resolutions or [])
             if entry.refine_at is None and sizes > 1 and sizes != len(self.stages or []):
@@ -221,7 +220,7 @@ class Config(Table):
         return self
 
     @model_validator(mode="after")
-    def _scheduled(self) -> Config:
+    def _scheduled(self, info: ValidationInfo) -> Config:
         if (
             "final_learning_rate_ratio" in self.model_fields_set
             and "learning_rate_schedule" not in self.model_fields_set
@@ -234,19 +233,21 @@ class Config(Table):
                 "final_learning_rate_ratio has no effect with learning_rate_schedule = 'constant'; remove one of them"
             )
         if self.warmup_steps >= self.iterations:
+            name = _name_of_iterations(info)
             raise ValueError(
-                f"warmup_steps = {self.warmup_steps} is not less than iterations = {self.iterations}; "
-                "lower it, or raise 'iterations'"
+                f"warmup_steps = {self.warmup_steps} is not less than {name} = {self.iterations}; lower it, or raise "
+                f"'{name}'"
             )
         return self
 
     @model_validator(mode="after")
-    def _entries(self) -> Config:
+    def _entries(self, info: ValidationInfo) -> Config:
         for entry in self.parameters:
             if entry.refine_at and entry.refine_at[-1] >= self.iterations:
+                name = _name_of_iterations(info)
                 entry._refuse(
-                    f"refine_at {entry.refine_at[-1]} is not less than iterations = {self.iterations}; "
-                    "refine earlier, or raise 'iterations'"
+                    f"refine_at {entry.refine_at[-1]} is not less than {name} = {self.iterations}; refine earlier, or "
+                    f"raise '{name}'"
                 )
         used = {name for entry in self.derived for name in entry.of}
         for entry in self.parameters:
@@ -366,6 +367,11 @@ class Config(Table):
         return tuple(np.random.SeedSequence([self.seed, stream, iteration, sensor]).generate_state(count).tolist())
 
 
+def _name_of_iterations(info: ValidationInfo) -> str:
+    """Return the name of the key ``iterations`` in messages."""
+    return str((info.context or {}).get("iterations", "iterations"))
+
+
 # Models of nested tables, by their key in the file or by their name in pydantic's error locations.
 _TABLES: dict[str, type[BaseModel]] = {
     "parameters": Parameter,
@@ -406,7 +412,7 @@ def load_config(path: str | Path, changes: Sequence[str] = ()) -> Config:
 def read_config(path: Path, changes: Sequence[str] = ()) -> tuple[Config, bytes]:
     """Read a job as `load_config` does. Returns the job and the content of its file, without the changes."""
     content = _content(path)
-    return _checked(str(path), _table(path, content, changes)), content
+    return make_config(_table(path, content, changes), str(path)), content
 
 
 def read_table(path: Path, changes: Sequence[str] = ()) -> Any:
@@ -431,7 +437,7 @@ def _content(path: Path) -> bytes:
         raise PathreplayError(f"Config {path} cannot be read ({error}); give a UTF-8 text file") from None
 
 
-def _table(path: Path, content: bytes, changes: Sequence[str]) -> object:
+def _table(path: Path, content: bytes, changes: Sequence[str]) -> Any:
     """Parse the content of the file of a job. Raises PathreplayError if the content is not valid."""
     try:
         text = io.StringIO(content.decode("utf-8"), newline=None).read()
@@ -440,13 +446,12 @@ def _table(path: Path, content: bytes, changes: Sequence[str]) -> object:
     return defined(parsed(path, text), changes)
 
 
-def make_config(values: Json, name: str = "config") -> Config:
-    """Make a job from a dictionary, with the checks and messages of `load_config`. Messages call the job ``name``."""
-    return _checked(name, values)
+def make_config(values: Json, name: str = "config", names: Mapping[str, str] | None = None) -> Config:
+    """Make a job from a dictionary, with the checks and messages of `load_config`.
 
-
-def _checked(name: str, job: object) -> Config:
+    Messages call the job ``name``. ``names`` are the names in messages of keys that the caller calls differently.
+    """
     try:
-        return Config.model_validate(job)
+        return Config.model_validate(values, context=names)
     except ValidationError as error:
-        raise PathreplayError(f"{name}: {first_error(error, Config, _TABLES)}") from None
+        raise PathreplayError(f"{name}: {first_error(error, Config, _TABLES, names or {})}") from None
