@@ -164,6 +164,9 @@ def test_what_cannot_go_on_is_told_in_one_line(photos: list[np.ndarray]) -> None
     told("executor = 'ray': objects in memory cannot be sent", executor="ray", output=None, resume=False)
     Path("file").write_text("")
     told("is not a run folder", output="file")
+    told("a file has that name; give another 'output'$", output="file", resume=False)
+    told("has no name of its own; give 'output' a new name", output="..", resume=False)
+    told("cannot be created .*; give another 'output'$", output="file/run", resume=False)
     with pytest.raises(PathreplayError, match=r"started in Python.*minimize\(problem, output='run', resume=True\)"):
         optimize(resume="run", progress=False)
     exported = CliRunner().invoke(app, ["export", "run"])

@@ -67,13 +67,12 @@ class RunFolder:
     """A folder that belongs to one run until its ``lock`` is closed.
 
     Args:
-        given: path of the folder, absolute or relative to ``home``.
-        home: folder to which a relative ``given`` refers; default: the current folder at construction.
+        given: path of the folder, absolute or relative to the current folder.
         in_python: whether the job has Python objects; see `Job`.
     """
 
-    def __init__(self, given: Path, home: Path | None = None, in_python: bool = False) -> None:
-        self.given, self.home = given, Path.cwd() if home is None else home
+    def __init__(self, given: Path, in_python: bool = False) -> None:
+        self.given, self.home = given, Path.cwd()
         self.in_python = in_python
         self.path = self.home / given
         self.lock = FolderLock(self.path)
@@ -227,13 +226,13 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
     missing = [folder for folder in (home / output).parents if not folder.exists()]
     with undisturbed(), contextlib.ExitStack() as undo:
         undo.callback(_remove_empty, missing)
-        part = _make_part(output, home)
+        part = _make_part(output, home, job.source)
         undo.callback(shutil.rmtree, part, ignore_errors=True)
         run = RunFolder(part, in_python=job.in_python)
         run.given, run.home, run.created_parents = _free(output, home), home, missing
         undo.callback(run.lock.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
-        run.given = _claim(part, output, home)
+        run.given = _claim(part, output, home, job.source)
         run.path = home / run.given
         undo.pop_all()
     return run
@@ -270,10 +269,9 @@ def open_run_folder(path: Path, in_python: bool = False) -> tuple[Job, RunFolder
             the job has Python objects and ``in_python`` is False, or vice versa.
     """
     require_writable_name(path, "--resume")
-    copy = _config_in(path)
+    job = read_job(path)
     if not (path / CHECKPOINT).is_file():
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start a new run")
-    job = _job(path, copy)
     if job.in_python != in_python:
         what = "was started in Python, with objects" if job.in_python else "was started from the file of a job"
         raise PathreplayError(f"Run {path} {what}; resume it with: {resume_command(path, job.in_python)}")
@@ -297,19 +295,11 @@ def read_job(path: Path) -> Job:
 
     Raises PathreplayError if ``path`` is not a run folder, or is damaged.
     """
-    return _job(path, _config_in(path))
-
-
-def _config_in(path: Path) -> Path:
     copy = next((path / name for name in _CONFIGS if (path / name).is_file()), None)
     if copy is None or not (path / "run.json").is_file():
         raise PathreplayError(
             f"{path} is not a run folder (config or run.json missing); give a folder that optimize has created"
         )
-    return copy
-
-
-def _job(path: Path, copy: Path) -> Job:
     try:
         if problem := file_problem(path / "run.json", 2**20):  # the limit is far more than a few paths need
             raise ValueError(f"it {problem}")
@@ -338,13 +328,18 @@ def new_output(output: str | Path | None, source: Path | None) -> Path:
     if output is None:
         named = "optimize" if source is None else source.stem
         return Path("runs") / (source.resolve().parent.name if source and named == "config" else named)
-    path = Path(output)
-    require_writable_name(path, "--output")
+    path, option = Path(output), _option(source)
+    require_writable_name(path, option)
     if not str(output) or path.name in ("", ".."):
-        raise PathreplayError(f"Run folder '{output}' has no name of its own; give --output a new name: runs/mine")
+        raise PathreplayError(f"Run folder '{output}' has no name of its own; give {option} a new name: runs/mine")
     if os.path.lexists(path) and not path.is_dir():
-        raise PathreplayError(f"Run folder {path} cannot be created: a file has that name; give another --output")
+        raise PathreplayError(f"Run folder {path} cannot be created: a file has that name; give another {option}")
     return path
+
+
+def _option(source: Path | None) -> str:
+    """Return the name of the option of the run folder: that of Python if the config is not a file."""
+    return "'output'" if source is None else "--output"
 
 
 def require_writable_name(path: Path, option: str) -> None:
@@ -367,7 +362,7 @@ def _remove_empty(folders: Iterable[Path]) -> None:
             folder.rmdir()
 
 
-def _make_part(output: Path, home: Path) -> Path:
+def _make_part(output: Path, home: Path, source: Path | None) -> Path:
     """Create a hidden folder beside ``output``. `_claim` renames the hidden folder when its content is complete."""
     wanted = home / output
     part = wanted.with_name(f".{wanted.name[:100]}.{secrets.token_hex(4)}{PART}")
@@ -376,7 +371,7 @@ def _make_part(output: Path, home: Path) -> Path:
         part.mkdir()
         return part
     except OSError as error:
-        raise PathreplayError(_not_made(output, error)) from error
+        raise PathreplayError(_not_made(output, error, source)) from error
 
 
 def _free(output: Path, home: Path) -> Path:
@@ -388,7 +383,7 @@ def _free(output: Path, home: Path) -> Path:
     return path
 
 
-def _claim(part: Path, output: Path, home: Path) -> Path:
+def _claim(part: Path, output: Path, home: Path, source: Path | None) -> Path:
     """Rename the folder to the first free name, and return this name.
 
     Two concurrent runs cannot get the same name: folders of runs are not empty, and renaming to a folder that is not
@@ -401,11 +396,11 @@ def _claim(part: Path, output: Path, home: Path) -> Path:
             return path
         except OSError as error:
             if error.errno not in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
-                raise PathreplayError(_not_made(output, error)) from error
+                raise PathreplayError(_not_made(output, error, source)) from error
 
 
-def _not_made(output: Path, error: OSError) -> str:
-    return f"Run folder {output} cannot be created ({error.strerror}); give another --output"
+def _not_made(output: Path, error: OSError, source: Path | None) -> str:
+    return f"Run folder {output} cannot be created ({error.strerror}); give another {_option(source)}"
 
 
 @contextlib.contextmanager
