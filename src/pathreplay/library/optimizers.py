@@ -36,14 +36,12 @@ class Stepper(Protocol):
         """Return the values after a step: arrays by name, in the shapes of ``values``."""
 
 
-class OfMitsuba:
+class OfMitsuba(Optimiser):
     """`Optimiser` that is an object of `mitsuba.ad` or `drjit.opt`.
 
     Parameters with a learning rate of their own use it. Other parameters use the optimiser's learning rate, to which
     the schedule and the stages of the problem apply as well.
     """
-
-    finished = ""
 
     def __init__(self, optimizer: Any, values: Arrays, problem: Problem) -> None:
         if any(True for _ in optimizer.keys()):
@@ -89,9 +87,6 @@ class OfMitsuba:
         found: float | dr.ArrayBase = common_rate if own_rate is None else own_rate
         return found * (rate / self._problem_rates[key])
 
-    def answer(self, values: Arrays) -> dict[str, Array]:
-        return {}
-
     def state(self) -> State:
         """See `Optimiser`. The arrays, named NUMBER:KEY, are Dr.Jit's state of the variables, such as moments."""
         kept = {key: _leaves(self._optimizer.state[key][3:]) for key in self._steps}
@@ -128,10 +123,8 @@ def _with_leaves(tree: object, leaves: Iterator[dr.ArrayBase]) -> Any:
     return next(leaves) if dr.is_array_v(tree) else tree
 
 
-class OfUser:
+class OfUser(Optimiser):
     """`Optimiser` that is an object with a step method: see `Stepper`."""
-
-    finished = ""
 
     def __init__(self, stepper: Stepper, values: Arrays) -> None:
         self._stepper: Any = stepper  # typed Any, because state_dict() and load_state_dict() are optional
@@ -156,9 +149,6 @@ class OfUser:
                 )
             self._steps[key] += 1
         return stepped
-
-    def answer(self, values: Arrays) -> dict[str, Array]:
-        return {}
 
     def state(self) -> State:
         """See `Optimiser`. Raises PathreplayError if the object has no ``state_dict``."""

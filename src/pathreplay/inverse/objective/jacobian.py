@@ -19,8 +19,8 @@ from pathreplay.integrators.stateful import StatefulIntegrator
 from pathreplay.inverse.objective.frozen import Recordings, RenderRequest, linear_derivative
 from pathreplay.inverse.objective.shared_sensors import SharedSensors
 from pathreplay.inverse.parameters.exposures import EXPOSURE, derivatives_by_factors, factor_of
-from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Half, Matrix, model_of
-from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Half, model_of
+from pathreplay.inverse.parameters.values import Array, Arrays, split
 from pathreplay.inverse.problem.problem import Problem, scene_values
 from pathreplay.platform import memory
 
@@ -95,14 +95,7 @@ class Jacobians:
         weight = None if about.weight is None else mi.TensorXf(about.weight)
         slope = np.array(linear_derivative(self.problem.loss, mi.TensorXf(about.target), weight)[1]) * share
         loss, gradient, model = model_of(a, b, np.broadcast_to(slope, about.target.shape), sizes)
-        return loss, self._split(values, gradient), dropped, model
-
-    def _split(self, values: Arrays, gradient: Matrix) -> dict[str, Array]:
-        parts = np.split(gradient, np.cumsum([values[key].size for key in self._moving])[:-1])
-        return {
-            key: part.astype(np.float32).reshape(values[key].shape)
-            for key, part in zip(self._moving, parts, strict=True)
-        }
+        return loss, split(gradient, {key: values[key].shape for key in self._moving}), dropped, model
 
     def _half(self, values: Arrays, view: int, request: RenderRequest) -> Half:
         """Render the image of a view, and its derivatives with respect to all entries."""

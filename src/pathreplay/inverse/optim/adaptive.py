@@ -44,7 +44,7 @@ class Optimiser(Protocol):
     If the shape of a variable changes, its state is reset. Variables that are missing from a step keep their state.
     """
 
-    finished: str
+    finished: str = ""
     """Reason why the optimiser has stopped; "" while it runs."""
 
     def step(
@@ -65,6 +65,7 @@ class Optimiser(Protocol):
         Args:
             values: values after the last step.
         """
+        return {}
 
     def state(self) -> State:
         """Return all state that later steps depend on, besides the values."""
@@ -73,7 +74,7 @@ class Optimiser(Protocol):
         """Restore a state bit for bit. Raises KeyError or ValueError if it does not fit the variables."""
 
 
-class DrJitOptimiser:
+class DrJitOptimiser(Optimiser):
     """An `Optimiser` of ``drjit.opt``.
 
     Large variables are stepped in pieces (see `PIECE`). Between steps, the optimiser keeps the state of each variable,
@@ -85,8 +86,6 @@ class DrJitOptimiser:
         uniform: keys of variables for which Adam and AdamW normalise all entries by the variable's largest second
             moment (UniformAdam). Entries with small gradients then hardly move.
     """
-
-    finished = ""
 
     def __init__(self, values: Arrays, options: Optimizer | None = None, uniform: Collection[str] = ()) -> None:
         wanted = Optimizer() if options is None else options
@@ -159,9 +158,6 @@ class DrJitOptimiser:
                 known |= part.state
             part.state = known
         return stepped
-
-    def answer(self, values: Arrays) -> dict[str, Array]:
-        return {}
 
     def _remembered(self, name: str, part: drjit.opt.Optimizer) -> dict[str, dr.ArrayBase]:
         """Return the state arrays of a piece of a variable, by kind (first moment, etc.)."""

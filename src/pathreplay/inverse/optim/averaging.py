@@ -79,14 +79,12 @@ class _Means:
         return self.scatter + _weight(SHORT, n) * (scatter - self.scatter), lag
 
 
-class Averaged:
+class Averaged(Optimiser):
     """An `Optimiser` whose result is the combination of its last iterate with a mean of recent iterates.
 
     The steps are those of the given optimiser. Each variable has its own combination; variables of more than `MOST`
     entries have none.
     """
-
-    finished = ""
 
     def __init__(self, optimiser: Optimiser) -> None:
         self._optimiser = optimiser
@@ -126,9 +124,7 @@ class Averaged:
     def restore(self, state: State, values: Arrays) -> None:
         """See `Optimiser`. The means of a variable whose means are not in the state begin with its next step."""
         stored = set(state.arrays)
-        names = [name for name in state.arrays if not name.startswith(MEANS)]
-        rest = WhenAsked({name: partial(state.arrays.__getitem__, name) for name in names})
-        self._optimiser.restore(State(state.steps, rest), values)
+        self._optimiser.restore(state, values)  # ignores the arrays of the means
         self._means = {}
         for key, count in state.steps.items():
             if not count or values[key].size > MOST or stored.isdisjoint(what + key for what in MEANS):

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.optimizer_options import Optimizer
-from pathreplay.inverse.optim.adaptive import State
-from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.optim.adaptive import Optimiser, State
+from pathreplay.inverse.parameters.values import Array, Arrays, split
 
 MOST = 1000
 """Maximum number of parameter entries, because checkpoints contain the gradients of all iterations."""
@@ -38,7 +38,7 @@ class _Asked(Exception):
     """SciPy requests an evaluation that is not in the record."""
 
 
-class LineSearch:
+class LineSearch(Optimiser):
     """`Optimiser` that runs a deterministic minimiser with bounds.
 
     The minimiser sees variables divided by their initial learning rates, and losses divided by the initial loss.
@@ -75,7 +75,6 @@ class LineSearch:
         self._points: list[Vector] = []
         self._losses: list[float] = []
         self._gradients: list[Vector] = []
-        self.finished = ""
 
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
@@ -89,7 +88,7 @@ class LineSearch:
         self._losses.append(float(loss))
         self._gradients.append(_flat({key: gradients[key] for key in values}) * self._scale)
         self._ask()
-        return self.answer(values) if self.finished else self._split(self._next)
+        return self.answer(values) if self.finished else split(self._next * self._scale, self._shapes)
 
     def _ask(self) -> None:
         """Run the minimiser on the recorded evaluations, until it requests a new evaluation or finishes."""
@@ -122,17 +121,11 @@ class LineSearch:
         reason = "the loss has converged" if success else "no step lowers the loss, possibly because of noise"
         self.finished = f"{reason} ({' '.join(message.split())})"
 
-    def _split(self, x: Vector) -> dict[str, Array]:
-        parts, at = {}, 0
-        for key, shape in self._shapes.items():
-            n = int(np.prod(shape))
-            parts[key] = (x[at : at + n] * self._scale[at : at + n]).astype(np.float32).reshape(shape)
-            at += n
-        return parts
-
     def answer(self, values: Arrays) -> dict[str, Array]:
         """Return the point with the lowest loss so far, or an empty dictionary before the first step."""
-        return self._split(self._points[int(np.argmin(self._losses))]) if self._losses else {}
+        if not self._losses:
+            return {}
+        return split(self._points[int(np.argmin(self._losses))] * self._scale, self._shapes)
 
     def state(self) -> State:
         """See `Optimiser`. The state consists of start, scales, recorded evaluations and next point."""

@@ -27,9 +27,9 @@ import scipy.linalg
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.optimizer_options import Optimizer
-from pathreplay.inverse.optim.adaptive import State
+from pathreplay.inverse.optim.adaptive import Optimiser, State
 from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Matrix
-from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.values import Array, Arrays, split
 
 MOST = 200
 """Largest number of entries. Each entry takes two forward passes per view and iteration."""
@@ -83,7 +83,7 @@ class Point:
     model: GaussNewton
 
 
-class LevenbergMarquardt:
+class LevenbergMarquardt(Optimiser):
     """Levenberg-Marquardt with bounds, as an `Optimiser`: `observe` has to precede each `step`.
 
     Learning rates have no effect.
@@ -148,7 +148,7 @@ class LevenbergMarquardt:
             self._average(seen)
         else:
             self._search(seen)
-        return self._split(self._next)
+        return split(self._next, self._shapes)
 
     def _search(self, seen: Point) -> None:
         """Accept or reject a step on common random numbers, and propose the next step."""
@@ -264,18 +264,11 @@ class LevenbergMarquardt:
         H, noise = (matrix[np.ix_(free, free)] / unit for matrix in (_positive(model), model.noise))
         return 0.5 * float(np.trace(scipy.linalg.pinvh(H, rtol=FLAT) @ noise)) if free.any() else 0.0
 
-    def _split(self, x: Matrix) -> dict[str, Array]:
-        parts = np.split(x, np.cumsum(list(self._sizes.values()))[:-1])
-        return {
-            key: part.astype(np.float32).reshape(shape)
-            for (key, shape), part in zip(self._shapes.items(), parts, strict=True)
-        }
-
     def answer(self, values: Arrays) -> dict[str, Array]:
         """Return the last accepted point of a search; an empty dictionary before the first step and while averaging."""
         if self._base is None or (self._count and not self.finished):
             return {}
-        return self._split(self._next if self._count else self._base.at)
+        return split(self._next if self._count else self._base.at, self._shapes)
 
     def state(self) -> State:
         """See `Optimiser`. The state is the last accepted evaluation and the numbers that control the steps."""

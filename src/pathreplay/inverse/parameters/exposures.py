@@ -24,35 +24,30 @@ EXPOSURE = "exposure"
 """Key of the variable, of shape (views, 1), or (views, colours) with white balance."""
 
 
-class Factors:
-    """Logarithmic coordinates (`Coordinates`) of the factors. The common scale of the factors can be fixed.
+class Factors(Transform):
+    """Logarithmic coordinates of the factors. The common scale of the factors can be fixed.
 
     The argument ``fixed`` contains indices of views. After each step, the mean logarithm of the factors of these views
     is subtracted from all logarithms, separately for each colour. The geometric mean of these views' factors therefore
     stays 1. If ``fixed`` is empty, nothing is subtracted and the common scale is free.
     """
 
-    uniform = False
-
     def __init__(self, fixed: Sequence[int]) -> None:
+        super().__init__("log")
         self.fixed = list(fixed)
-        self._log = Transform("log")
-
-    def latent(self, values: Array) -> Array:
-        return self._log.latent(values)
 
     def gradient(self, values: Array, by_values: Array) -> Array:
         """See `Coordinates`.
 
         `values` subtracts the mean of the logarithms in ``fixed``. The gradient includes the derivative of this mean.
         """
-        by_latent = self._log.gradient(values, by_values)
+        by_latent = super().gradient(values, by_values)
         if self.fixed:
             by_latent[self.fixed] -= by_latent.sum(axis=0) / len(self.fixed)
         return by_latent
 
     def values(self, latent: Array) -> Array:
-        return self._log.values(latent - latent[self.fixed].mean(axis=0) if self.fixed else latent)
+        return super().values(latent - latent[self.fixed].mean(axis=0) if self.fixed else latent)
 
 
 def start(views: int, channels: int, white_balance: bool) -> Array:

@@ -23,13 +23,13 @@ from math import prod
 import numpy as np
 import scipy.sparse
 
-from pathreplay.inverse.parameters.reparameterization import Transform
+from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
 from pathreplay.inverse.parameters.values import Array
 
 Shape = tuple[int, ...]
 
 
-class Pyramid:
+class Pyramid(Coordinates):
     """Coordinates (`Coordinates`) of a grid: the levels of a pyramid, coarsest first, in one flat array.
 
     Each level has half as many entries along each axis as the next finer level, rounded up. The coarsest level has one
@@ -40,8 +40,6 @@ class Pyramid:
         wraps: whether the x axis (the one before the channels) is periodic, as in environment maps.
         inner: coordinates of the entries, such as logarithms. The pyramid then represents the latent variables.
     """
-
-    uniform = False
 
     def __init__(self, shapes: Sequence[Shape], wraps: bool, inner: Transform | None = None) -> None:
         self._wraps, self.inner = wraps, inner

@@ -22,7 +22,7 @@ LARGEST_LOG = 88.0
 class Coordinates(Protocol):
     """A change of coordinates between values v and the latent variables u that the optimiser steps."""
 
-    uniform: bool
+    uniform: bool = False
     """Whether the optimiser should normalise all entries of u by their largest second moment (UniformAdam)."""
 
     def latent(self, values: Array) -> Array:
@@ -35,7 +35,7 @@ class Coordinates(Protocol):
         """Compute v from u."""
 
 
-class Transform:
+class Transform(Coordinates):
     """Entrywise coordinates that keep values within (lower, upper).
 
     log       v = exp u
@@ -44,8 +44,6 @@ class Transform:
 
     The computation is in double precision. The results are in single precision.
     """
-
-    uniform = False
 
     def __init__(self, kind: TransformKind, lower: float = -np.inf, upper: float = np.inf) -> None:
         self.kind = kind

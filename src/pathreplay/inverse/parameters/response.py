@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pathreplay.inverse.images.io import Image, encoded
+from pathreplay.inverse.parameters.reparameterization import Coordinates
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 RESPONSE = "response"
@@ -28,14 +29,12 @@ SMALLEST = 1e-6
 """Smallest value whose logarithm is taken."""
 
 
-class Increments:
+class Increments(Coordinates):
     """Coordinates (`Coordinates`) of a monotone curve: logarithms of the differences between neighbouring knots.
 
     The values at the knots ``held`` are fixed, among them the first and the last knot. The differences between two
     consecutive fixed knots are scaled so that they add up to the difference of the fixed values.
     """
-
-    uniform = False
 
     def __init__(self, held: Sequence[int], values: Array) -> None:
         self.held = list(held)

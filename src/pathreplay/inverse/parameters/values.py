@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import prod
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.caustics.heights import caustic_heights
@@ -93,9 +95,8 @@ def make_heights(key: str, shape: tuple[int, ...], value: TransportStart, base: 
     )
     if value.fit == "crop":
         image = resized(image, shape[0], shape[1], crop=True)
-    names = ("width", "distance", "eta", "receiver_width", "source_distance", "thickness", "mirror_angle")
     try:
-        optics = Optics(**{name: getattr(value, name) for name in names})
+        optics = Optics(**value.model_dump(exclude={"transport", "floor", "fit", "raw"}))
         return caustic_heights(image, optics, (shape[0], shape[1]), value.floor)
     except PathreplayError as error:
         raise PathreplayError(f"Parameter '{key}': {error}") from None
@@ -123,6 +124,12 @@ def adapted_image(name: str, image: Image, other: str, channels: int) -> Image:
         raise PathreplayError(f"{name} has {image.shape[2]} channels, but {other} {channels}; convert it")
     require_finite_array(name, adapted)
     return adapted
+
+
+def split(x: NDArray[np.floating], shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+    """Split a flat array into consecutive arrays of the given shapes, by key."""
+    parts = np.split(x, np.cumsum([prod(shape) for shape in shapes.values()])[:-1])
+    return {k: part.astype(np.float32).reshape(shapes[k]) for k, part in zip(shapes, parts, strict=True)}
 
 
 def require_finite_array(name: str, array: Array) -> None:
