@@ -111,14 +111,15 @@ def from_photos(
         near = near_clip(frames) if proxy is None else NO_CLIP
         speed = measure(part / "scene.xml", frames, near)
         tell(f"this machine renders {speed.samples / 1e6:.2g} million samples per second")
-        plan = plan_stages(speed, minutes, trained, *size, str(output / JOB))
-        densest = OPAQUE * plan.stages[-1].resolution / float(region.size.max())
+        stages = plan_stages(speed, minutes, trained, *size)
+        densest = OPAQUE * stages[-1].resolution / float(region.size.max())
         choices = Choices(has_sky or proxy is not None, refine_poses, near, HEADROOM * prepared.peak, densest)
         key = None if proxy is None else proxy.key
-        _write(part, {JOB: job_text(str(folder), plan, choices, test_every, key).encode()})
+        text = job_text(str(folder), str(output / JOB), stages, choices, test_every, key)
+        _write(part, {JOB: text.encode()})
     corners = " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (region.low, region.high))
     notes.append(f"region: {corners}" if proxy is None else f"geometry: {mesh}")
-    notes.append(_stages_note(plan.stages, *size))
+    notes.append(_stages_note(stages, *size))
     return PhotoJob(output, notes)
 
 

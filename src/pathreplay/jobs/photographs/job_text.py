@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import quoteattr
 
-from pathreplay.jobs.photographs.plan import EVAL_SPP, Plan
+from pathreplay.jobs.photographs.plan import EVAL_SPP, StagePlan
 from pathreplay.jobs.photographs.region import Box
 
 DENSITY, RADIANCE, SKY = "box.interior_medium.sigma_t.data", "box.interior_medium.radiance.data", "sky.data"
@@ -100,15 +100,20 @@ def _xyz(values: Iterable[float]) -> str:
     return " ".join(f'{axis}="{value:.9g}"' for axis, value in zip("xyz", values, strict=True))
 
 
-def job_text(source: str, plan: Plan, choices: Choices, test_every: int, mesh_key: str | None = None) -> str:
-    """Return the text of a job. ``mesh_key`` is the key of a given mesh's reflectance, or None for a density grid."""
-    tables = [_head(source, choices.near_clip, plan, test_every, mesh_key is None), _EXPOSURE]
-    tables += _field(plan, choices) if mesh_key is None else [_colour(mesh_key)]
+def job_text(
+    source: str, job: str, stages: Sequence[StagePlan], choices: Choices, test_every: int, mesh_key: str | None = None
+) -> str:
+    """Return the text of a job, whose path is ``job``.
+
+    ``mesh_key`` is the key of a given mesh's reflectance, or None for a density grid.
+    """
+    tables = [_head(source, job, choices.near_clip, test_every, mesh_key is None), _EXPOSURE]
+    tables += _field(stages, choices) if mesh_key is None else [_colour(mesh_key)]
     if choices.has_sky:
         tables.append(_SKY)
     tables.append(_commented(_RESPONSE))
     tables.append(_POSES if choices.refine_poses else _commented(_POSES))
-    for stage in plan.stages:
+    for stage in stages:
         text = f"[[stages]]\niterations = {stage.iterations}\ndownscale = {stage.downscale}\n"
         text += f"view_batch_size = {stage.views}\nspp = {stage.spp}\n"
         if names := _moving(stage.first, choices, mesh_key):
@@ -127,11 +132,11 @@ def _moving(first: bool, choices: Choices, mesh_key: str | None) -> list[str]:
     return [*([DENSITY, RADIANCE] if mesh_key is None else [mesh_key]), *([SKY] if choices.has_sky else [])]
 
 
-def _head(source: str, near_clip: float, plan: Plan, test_every: int, in_medium: bool) -> str:
+def _head(source: str, job: str, near_clip: float, test_every: int, in_medium: bool) -> str:
     medium = 'medium = "field"                     # cameras may be inside the box\n' if in_medium else ""
     return f"""\
 # Recovers a scene from photographs. Written by: pathreplay from-photos {source}
-# Edit it and run it again: pathreplay optimize {plan.name}
+# Edit it and run it again: pathreplay optimize {job}
 # docs/do/photographs.md explains the choices, docs/optimize.md all keys.
 
 scene = "scene.xml"
@@ -154,8 +159,8 @@ learning_rate = 0.01
 """
 
 
-def _field(plan: Plan, choices: Choices) -> list[str]:
-    sizes = ", ".join(str(stage.resolution) for stage in plan.stages)
+def _field(stages: Sequence[StagePlan], choices: Choices) -> list[str]:
+    sizes = ", ".join(str(stage.resolution) for stage in stages)
     return [
         f"""\
 [[parameters]]

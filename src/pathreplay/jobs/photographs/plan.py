@@ -47,15 +47,6 @@ class StagePlan:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """The stages of a job."""
-
-    stages: list[StagePlan]
-    name: str
-    """Path of the job."""
-
-
-@dataclass(frozen=True)
 class Speed:
     """Speed of a machine on a scene."""
 
@@ -67,7 +58,7 @@ class Speed:
     """Seconds to compile the kernels of an image, once per stage."""
 
 
-def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: int, name: str) -> Plan:
+def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: int) -> list[StagePlan]:
     """Choose the stages that fit into a time limit.
 
     If the last stage would have less than `LEAST` iterations, it is left out, and the other stages share its time. This
@@ -79,7 +70,6 @@ def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: 
         trained: number of training views.
         width: width of the images in pixels.
         height: height of the images in pixels.
-        name: path of the job.
     """
     seconds, shares = 60 * minutes * USED, dict(SHARES)
     while True:
@@ -100,4 +90,4 @@ def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: 
         if stages[-1].iterations >= LEAST or len(shares) == 1:
             break
         del shares[stages[-1].downscale]
-    return Plan([replace(s, iterations=min(max(s.iterations, LEAST), MOST)) for s in stages], name)
+    return [replace(s, iterations=min(max(s.iterations, LEAST), MOST)) for s in stages]
