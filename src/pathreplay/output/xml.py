@@ -7,6 +7,7 @@ references, and replaces film sizes and sample counts by variables such as ``$re
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 from xml.etree import ElementTree
 
@@ -32,42 +33,37 @@ def scene_xml(described: Described, from_file: bool) -> bytes:
     PathreplayError for values that XML cannot represent.
     """
     uses = Counter(id(child) for node in described.nodes for _, child in described.children(node))
-    names = _Names(described, uses, from_file)
-    tree = _element(described, described.nodes[0], "", names, set())
+    ids = _ids(described, uses, from_file)
+    tree = _element(described, described.nodes[0], "", ids, set())
     tree.set("version", mi.__version__)
     ElementTree.indent(tree, "    ")
     return ElementTree.tostring(tree, encoding="utf-8", xml_declaration=True) + b"\n"
 
 
-class _Names:
-    """The ids of objects in the XML file.
+def _ids(described: Described, uses: Counter[int], from_file: bool) -> dict[int, str]:
+    """Return the ids of objects in the XML file, by `id` of the node.
 
     Objects that are used more than once have an id. Ids in a scene file are kept. In a dictionary, only names that are
     part of parameter keys are kept: the names of objects directly in the scene or in a shape group.
     """
-
-    def __init__(self, described: Described, uses: Counter[int], from_file: bool) -> None:
-        top = {id(child) for _, child in described.children(described.nodes[0])}
-        groups = [node for node in described.nodes if node.props.plugin_name() == "shapegroup"]
-        top |= {id(child) for group in groups for _, child in described.children(group)}
-        self._of: dict[int, str] = {}
-        taken: set[str] = set()
-        for i, node in enumerate(described.nodes[1:]):
-            name = node.props.id()
-            if not (uses[id(node)] > 1 or (name and (from_file or id(node) in top))):
-                continue
-            if not name or name in taken:
-                name = f"{name or 'object'}-{i}"
-            taken.add(name)
-            self._of[id(node)] = name
-
-    def of(self, node: Node) -> str | None:
-        return self._of.get(id(node))
+    top = {id(child) for _, child in described.children(described.nodes[0])}
+    groups = [node for node in described.nodes if node.props.plugin_name() == "shapegroup"]
+    top |= {id(child) for group in groups for _, child in described.children(group)}
+    ids: dict[int, str] = {}
+    taken = {""}
+    for i, node in enumerate(described.nodes[1:]):
+        name = node.props.id()
+        if uses[id(node)] > 1 or (name and (from_file or id(node) in top)):
+            ids[id(node)] = f"{name or 'object'}-{i}" if name in taken else name
+            taken.add(ids[id(node)])
+    return ids
 
 
-def _element(described: Described, node: Node, name: str, names: _Names, written: set[int]) -> ElementTree.Element:
+def _element(
+    described: Described, node: Node, name: str, ids: Mapping[int, str], written: set[int]
+) -> ElementTree.Element:
     called = {} if not name or name.startswith(_UNNAMED) else {"name": name}
-    identity = names.of(node)
+    identity = ids.get(id(node))
     if id(node) in written:
         return ElementTree.Element("ref", {"id": str(identity), **called})
     written.add(id(node))
@@ -82,7 +78,7 @@ def _element(described: Described, node: Node, name: str, names: _Names, written
     children = dict(described.children(node))
     for key in node.props.keys():
         if key in children:
-            element.append(_element(described, children[key], key, names, written))
+            element.append(_element(described, children[key], key, ids, written))
         else:
             element.append(_property(node, key))
     return element
