@@ -327,8 +327,9 @@ class Config(Table):
     def _searched(self) -> Config:
         if not self.optimizer.searches:
             return self
-        rates = {"learning_rate_schedule", "final_learning_rate_ratio", "warmup_steps"} & self.model_fields_set
-        wrong = sorted(rates | ({"stages", "baseline", "view_batch_size", "pixel_batch_size"} & self.model_fields_set))
+        rates = {"learning_rate_schedule", "final_learning_rate_ratio", "warmup_steps"}
+        others = {"stages", "baseline", "view_batch_size", "pixel_batch_size"}
+        wrong = sorted((rates | others) & self.model_fields_set)
         if self.spp == AUTO:
             wrong.append("spp = 'auto'")
         wrong += ["refine_at" for entry in self.parameters if len(entry.resolutions or []) > 1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import Annotated
 
 from pydantic import Field
@@ -35,10 +36,7 @@ class Stage(Table):
 
 def begins(stages: Sequence[Stage]) -> list[int]:
     """Return the first iteration of each stage, followed by the total number of iterations."""
-    firsts = [0]
-    for stage in stages:
-        firsts.append(firsts[-1] + stage.iterations)
-    return firsts
+    return list(accumulate((stage.iterations for stage in stages), initial=0))
 
 
 def place(stages: Sequence[Stage], iteration: int) -> int:

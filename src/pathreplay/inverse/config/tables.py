@@ -68,7 +68,7 @@ class Plugin(BaseModel):
     """Name of the plugin; its options are further keys of the same table."""
 
     @model_validator(mode="after")
-    def _has_edges(self) -> Plugin:
+    def _has_options(self) -> Plugin:
         if self.type not in ("pathreplay", "pathreplay_particles") and (
             asked := {"boundary", "boundary_spp"} & set(self.model_extra or {})
         ):
@@ -76,10 +76,6 @@ class Plugin(BaseModel):
                 f"'{min(asked)}' is an option of the integrator 'pathreplay', which '{self.type}' does not have; "
                 "remove it"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _of_32_bits(self) -> Plugin:
         for name, value in (self.model_extra or {}).items():
             if isinstance(value, int) and abs(value) >= 2**31:
                 raise ValueError(f"'{name}' of '{self.type}' is {shown(value)}; give an integer below {2**31}")

@@ -9,6 +9,7 @@ positions whenever they are set, and derivatives propagate through this computat
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -62,26 +63,16 @@ class HeightMap:
         return dr.gather(mi.Float, sums, self.merged)
 
 
-@dataclass(frozen=True)
-class HeightMaps:
-    """Displacement of vertices by several height maps. A call returns the positions displaced by all height maps."""
-
-    maps: tuple[HeightMap, ...]
-
-    def __call__(self, first: mi.Float, *heights: mi.TensorXf) -> mi.Float:
-        """Compute the displaced positions from the positions p₀ and one height map per entry of ``maps``."""
-        for place, grid in zip(self.maps, heights, strict=True):
-            first = place(first, grid)
-        return first
-
-
-def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> HeightMaps:
+def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> Callable[..., mi.Float]:
     """Make the displacement of a mesh, by one height map for each name in ``options.weights``.
 
     Args:
         params: parameters of the scene.
         key: key of the vertex positions of the mesh.
         options: direction, coordinates, factors and interpolation.
+
+    Returns:
+        A function that computes the displaced positions from the positions p₀ and the height maps.
 
     Raises:
         PathreplayError: the key is not the vertex positions of a mesh, or the mesh lacks coordinates or factors.
@@ -115,7 +106,13 @@ def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> 
                 options.interpolation == "cubic",
             )
         )
-    return HeightMaps(tuple(maps))
+
+    def displaced(first: mi.Float, *heights: mi.TensorXf) -> mi.Float:
+        for place, grid in zip(maps, heights, strict=True):
+            first = place(first, grid)
+        return first
+
+    return displaced
 
 
 def require_map(key: str, name: str, shape: tuple[int, ...]) -> None:

@@ -67,7 +67,7 @@ class TotalVariation:
                 length = np.sqrt(Δ * Δ + ROUND**2)
                 penalty += self.weight * float(np.mean(length - ROUND))
                 slope = self.weight * Δ / length / Δ.size
-                gradient += np.pad(slope, _ends(v.ndim, axis, 1, 0)) - np.pad(slope, _ends(v.ndim, axis, 0, 1))
+                gradient -= np.diff(slope, axis=axis, prepend=0, append=0)
         return penalty, gradient
 
 
@@ -185,7 +185,3 @@ def _differentiable(term: Term, values: mi.TensorXf) -> mi.TensorXf:
     value, slope = term(np.array(dr.detach(values)))
     linear = dr.sum((values - dr.detach(values)) * mi.TensorXf(with_space(slope.astype(np.float32))), axis=None)
     return linear + value
-
-
-def _ends(axes: int, axis: int, before: int, after: int) -> list[tuple[int, int]]:
-    return [(before, after) if k == axis else (0, 0) for k in range(axes)]
