@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,7 @@ class FolderRun:
     """Writes a run folder; ``observe`` receives all events of the run.
 
     Args:
-        job: the job; its config is replaced by the config of the problem.
+        job: the job, with the config of the problem.
         problem: the problem.
         run: the run before its first iteration. If a folder is resumed, the run is restored from its checkpoint.
         stop: request to stop the run, which the stop button of the live page sets.
@@ -135,9 +134,7 @@ def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tu
         before = render_views(problem, run.values)
     for view in problem.views:
         require_finite_loss(problem.loss, view.name, view.target, view.weight, before[view.name])
-    return create_run_folder(
-        output, replace(job, config=problem.config), first_files(problem, before, run), home
-    ), before
+    return create_run_folder(output, job, first_files(problem, before, run), home), before
 
 
 def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:

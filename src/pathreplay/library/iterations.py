@@ -118,12 +118,9 @@ def run_of(problem: Problem, pool: WorkerPool | None = None) -> Run:
 def _run(
     problem: Problem, integrator: mi.Integrator, plugin: Plugin, pool: WorkerPool | None, baseline: bool = False
 ) -> Run:
-    config = problem.config
-    if pool is not None:
-        executor = RayExecutor(pool, [view.name for view in problem.views], baseline)
-        return new_run(problem, integrator, optimizer=config.optimizer, executor=executor)
-    evaluate = evaluator_of(problem, integrator, plugin)
-    return new_run(problem, integrator, optimizer=config.optimizer, evaluate=evaluate)
+    executor = None if pool is None else RayExecutor(pool, [view.name for view in problem.views], baseline)
+    evaluate = evaluator_of(problem, integrator, plugin) if executor is None else None
+    return new_run(problem, integrator, optimizer=problem.config.optimizer, executor=executor, evaluate=evaluate)
 
 
 def iterations(

@@ -169,7 +169,9 @@ def _minimized(
             _, resumed = open_run_folder(output, in_python)
             stack.callback(resumed.lock.close)
             built = with_saved_targets(resumed.path, built)
-        run = _run(problem, built, own, stack, bar)
+        run = run_of(built, stack.enter_context(crew_of(built.config, problem.base, built, bar.remark, bar.status)))
+        if own is not None:
+            run.optimiser = adapted(own, built, run.values)
         kept = None
         if output is not None:
             run.optimiser.state()  # raises PathreplayError if the state of the user's optimizer cannot be saved
@@ -199,16 +201,6 @@ def _minimized(
 def _is_true(value: object) -> bool:
     """Return whether a callback's result is True. Comparisons of arrays are booleans of NumPy."""
     return isinstance(value, (bool, np.bool_)) and bool(value)
-
-
-def _run(problem: Problem, built: inner.Problem, own: object, stack: ExitStack, bar: Progress | NotebookPanel) -> Run:
-    """Create the run. The user's optimizer ``own``, if there is one, replaces the configured optimizer."""
-    config = built.config
-    pool = stack.enter_context(crew_of(config, problem.base, built, bar.remark, bar.status))
-    run = run_of(built, pool)
-    if own is not None:
-        run.optimiser = adapted(own, built, run.values)
-    return run
 
 
 def _observers(

@@ -23,7 +23,7 @@ def matching(names: Iterable[str], base: Path) -> Iterator[str]:
     Raises PathreplayError if no file matches a pattern, or if the name of a folder has wildcards.
     """
     for name in names:
-        if WILD.search(name) and not _exists(base / name):
+        if WILD.search(name) and not os.path.exists(base / name):
             yield from _expanded(name, base)
         else:
             yield name
@@ -58,10 +58,3 @@ def _expanded(name: str, base: Path) -> list[str]:
     if not names:
         raise PathreplayError(f"No file matches the pattern {shown(name)} in {base / folder}; correct it")
     return [os.path.join(folder, file) for file in sorted(names, key=lambda file: (natural(file), file))]
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except (OSError, ValueError):
-        return False

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
-from types import MappingProxyType
 
 import mitsuba as mi
 import numpy as np
@@ -224,24 +223,18 @@ def _require_alpha(what: str, image: Image, alpha: str, name: str, shape: tuple[
 
 
 def read_masks(
-    files: Mapping[str, str],
-    scene: mi.Scene,
-    sensors: dict[str, int],
-    base: Path,
-    *,
-    resize: bool = False,
-    lenses: Mapping[str, Lens] = MappingProxyType({}),
+    files: Mapping[str, str], how: Reading, scene: mi.Scene, sensors: dict[str, int], base: Path
 ) -> dict[str, Image]:
     """Read mask files as weights of the pixels, by view. Black pixels get the weight 0.
 
-    See `read_targets` and `Reading` for arguments and errors.
+    See `read_targets` for arguments and errors.
     """
     weights: dict[str, Image] = {}
     for name, file in files.items():
         shape = picture_shape(scene.sensors()[sensors[name]])
-        mask = _read(f"Mask '{file}'", find_image(file, base), name, shape, resize, raw=True)
-        if name in lenses:
-            mask, _ = lenses[name].undone(mask)
+        mask = _read(f"Mask '{file}'", find_image(file, base), name, shape, how.resize, raw=True)
+        if name in how.lenses:
+            mask, _ = how.lenses[name].undone(mask)
         mask = resized(mask, *shape[:2])
         weights[name] = as_weight(f"mask '{file}'", adapted_image(f"Mask '{file}'", mask, "a mask has", 1), name)
     return weights

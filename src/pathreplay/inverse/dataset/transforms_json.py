@@ -26,8 +26,7 @@ MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 Row = Annotated[list[Annotated[FiniteFloat, Field(gt=-1e9, lt=1e9)]], Field(min_length=4, max_length=4)]
 Length = Annotated[FiniteFloat, Field(gt=1e-3, lt=1e6)]
-Place = Annotated[FiniteFloat, Field(gt=-1e6, lt=1e6)]
-Bend = Annotated[FiniteFloat, Field(gt=-1e6, lt=1e6)]
+Bounded = Annotated[FiniteFloat, Field(gt=-1e6, lt=1e6)]
 
 
 class _Intrinsics(BaseModel):
@@ -39,17 +38,17 @@ class _Intrinsics(BaseModel):
     camera_angle_x: Annotated[FiniteFloat, Field(gt=1e-3, lt=math.pi - 1e-3)] | None = None
     fl_x: Length | None = None
     fl_y: Length | None = None
-    cx: Place | None = None
-    cy: Place | None = None
+    cx: Bounded | None = None
+    cy: Bounded | None = None
     w: Length | None = None
     h: Length | None = None
     is_fisheye: bool = False
-    k1: Bend = 0.0
-    k2: Bend = 0.0
-    k3: Bend = 0.0
-    k4: Bend = 0.0
-    p1: Bend = 0.0
-    p2: Bend = 0.0
+    k1: Bounded = 0.0
+    k2: Bounded = 0.0
+    k3: Bounded = 0.0
+    k4: Bounded = 0.0
+    p1: Bounded = 0.0
+    p2: Bounded = 0.0
 
 
 class _Frame(_Intrinsics):

@@ -74,27 +74,6 @@ class Stopped:
 
 Event = Started | Entered | Finished | Refined | NonFinite | LowSNR | Stepped | Stopped
 
-Told = Entered | Finished | Refined | NonFinite | LowSNR
-
-
-def note_of(event: Told) -> str:
-    """Describe an event in one line."""
-    if isinstance(event, Entered):
-        return f"stage {event.number} of {event.of}"
-    if isinstance(event, Finished):
-        return f"the optimiser has stopped: {event.why}"
-    if isinstance(event, Refined):
-        return f"{event.key} is refined to the shape {event.shape}"
-    if isinstance(event, NonFinite):
-        return (
-            f"{event.entries} gradient entries of '{event.key}' were NaN or infinite in view '{event.view}' at "
-            f"iteration {event.iteration} and count as zero; further ones are counted, but not reported"
-        )
-    return (
-        f"the gradient of '{event.key}' is dominated by noise since about iteration {event.iteration}: its "
-        f"signal-to-noise ratio is {event.ratio:.2g} with spp = {event.spp}; raise spp unless the value has converged"
-    )
-
 
 class Notes:
     """Log lines of events. Recurring events are reported once per parameter."""
@@ -104,10 +83,22 @@ class Notes:
 
     def of(self, event: Event) -> str:
         """Return the log line of an event, or "" if the event has no line or was reported before."""
-        if isinstance(event, (Started, Stepped, Stopped)):
+        if isinstance(event, Entered):
+            return f"stage {event.number} of {event.of}"
+        if isinstance(event, Finished):
+            return f"the optimiser has stopped: {event.why}"
+        if isinstance(event, Refined):
+            return f"{event.key} is refined to the shape {event.shape}"
+        if not isinstance(event, (NonFinite, LowSNR)) or (type(event), event.key) in self._told:
             return ""
-        if isinstance(event, (NonFinite, LowSNR)):
-            if (type(event), event.key) in self._told:
-                return ""
-            self._told.add((type(event), event.key))
-        return note_of(event)
+        self._told.add((type(event), event.key))
+        if isinstance(event, NonFinite):
+            return (
+                f"{event.entries} gradient entries of '{event.key}' were NaN or infinite in view '{event.view}' at "
+                f"iteration {event.iteration} and count as zero; further ones are counted, but not reported"
+            )
+        return (
+            f"the gradient of '{event.key}' is dominated by noise since about iteration {event.iteration}: its "
+            f"signal-to-noise ratio is {event.ratio:.2g} with spp = {event.spp}; raise spp unless the value has "
+            "converged"
+        )

@@ -338,7 +338,8 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
     """
     config = part.problem.config
     decay, iterations = config.final_learning_rate_ratio, config.iterations
-    factor = part.factor * rate(config.learning_rate_schedule, position, iterations, decay, config.warmup_steps)
+    factor = 1.0 if part.stage is None else part.stage.learning_rate_factor
+    factor *= rate(config.learning_rate_schedule, position, iterations, decay, config.warmup_steps)
     moving = [v for v in part.problem.variables if v.key in gradients]
     rates = {v.key: v.learning_rate * factor for v in moving}
     others = {v.key: v.coordinates for v in moving if v.coordinates}

@@ -44,22 +44,18 @@ def parts_of(array: Array, mean: bool = False) -> list[float]:
     return [float(f"{x:.{digits}g}") for x in (sums / np.diff(begins) if mean else sums)]
 
 
-def window_of(history: Sequence[Entry], begin: int = 0) -> Sequence[Entry]:
-    """Return the last max(n / 3, `SHORTEST`) of the n iterations since ``begin``, or none if n < `SHORTEST`."""
-    count = len(history) - begin
-    return history[-max(count // 3, SHORTEST) :] if count >= SHORTEST else ()
-
-
 def still_moves(history: Sequence[Entry], key: str, begin: int = 0) -> bool | None:
     """Test whether a variable still moves. Returns None if there are too few iterations since ``begin``.
 
     Let g be the sum of the gradient over a part of the variable. The test statistic of the part is
-    t = √n mean(g) / std(g) over a window of n iterations. If gradients are pure noise, the mean of t² over m parts is
-    about 1 ± √(2/m). The variable moves if this mean exceeds 1 + 7 √(2/m), and the gradient exceeds `LEFT` times the
-    initial gradient. Parts that stay constant, e.g. at a bound, are excluded.
+    t = √n mean(g) / std(g) over a window of n iterations: the last third, but at least `SHORTEST` iterations. If
+    gradients are pure noise, the mean of t² over m parts is about 1 ± √(2/m). The variable moves if this mean exceeds
+    1 + 7 √(2/m), and the gradient exceeds `LEFT` times the initial gradient. Parts that stay constant, e.g. at a bound,
+    are excluded.
     """
-    window = [entry for entry in window_of(history, begin) if key in entry.slopes]
-    first = [entry for entry in history[begin:] if key in entry.slopes][:_FIRST]
+    since = history[begin:]
+    window = [entry for entry in since[-max(len(since) // 3, SHORTEST) :] if key in entry.slopes]
+    first = [entry for entry in since if key in entry.slopes][:_FIRST]
     if len(window) < SHORTEST or len({len(entry.slopes[key]) for entry in (*window, *first)}) > 1:
         return None
     g, x = (np.array([getattr(entry, name)[key] for entry in window]) for name in ("slopes", "means"))

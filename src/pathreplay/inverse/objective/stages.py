@@ -35,11 +35,6 @@ class Part:
     moving: frozenset[str]
     """Variables that are differentiated and updated."""
 
-    @property
-    def factor(self) -> float:
-        """Return the factor on all learning rates."""
-        return 1.0 if self.stage is None else self.stage.learning_rate_factor
-
 
 def part_at(problem: Problem, iteration: int) -> Part:
     """Return the part (stage) that an iteration belongs to."""

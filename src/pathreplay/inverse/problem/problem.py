@@ -117,11 +117,6 @@ class Problem:
     cache: VariableCache = field(default_factory=VariableCache)
     """Cache of converted values."""
 
-    @property
-    def debias(self) -> bool:
-        """Whether the bias of the loss due to noise is removed to first order: see `ViewLoss.debias`."""
-        return self.config.debias
-
     @contextmanager
     def computing(self) -> Iterator[None]:
         """Return a context for renderings: it turns errors of integrators into PathreplayError, and limits the memory.
@@ -394,7 +389,8 @@ def _seen(
         targets, notes = _pictures(config, shots, opened, base, disk)
     if first and config.target.masks is not None:
         masks = by_view("masks", config.target.masks, opened.sensors, base)
-        targets = masked(targets, read_masks(masks, opened.scene, opened.sensors, base))
+        how = Reading(config.target.alpha)
+        targets = masked(targets, read_masks(masks, how, opened.scene, opened.sensors, base))
     return targets, truth, notes
 
 
@@ -450,7 +446,7 @@ def _pictures(
     lenses = {name: shot.lens for name, shot in shots.items() if shot.lens is not None}
     how = replace(how, resize=True, lenses=lenses)
     targets, notes = read_targets(pictures, how, scene, sensors, base, disk)
-    return masked(targets, read_masks(masks, scene, sensors, base, resize=True, lenses=lenses)), notes
+    return masked(targets, read_masks(masks, how, scene, sensors, base)), notes
 
 
 def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
