@@ -34,7 +34,6 @@ from pathreplay.inverse.config.stage_options import Stage, begins
 from pathreplay.inverse.config.tables import Argument, Count, Plugin, Positive, Switch, Table, Whole
 from pathreplay.inverse.config.target_options import NOTHING, Capture, Exposure, Response, Target
 from pathreplay.platform.files import MISSING, file_problem
-from pathreplay.types import Json
 
 PIXELWISE = ("l2", "relative-l2", "display-l2")
 """Losses that support pixel batches and Levenberg-Marquardt: the names of the losses in `pixelwise.QUADRATIC`."""
@@ -438,7 +437,7 @@ def _content(path: Path) -> bytes:
         raise PathreplayError(f"Config {path} cannot be read ({error}); give a UTF-8 text file") from None
 
 
-def _table(path: Path, content: bytes, changes: Sequence[str]) -> Any:
+def _table(path: Path, content: bytes, changes: Sequence[str]) -> object:
     """Parse the content of the file of a job. Raises PathreplayError if the content is not valid."""
     try:
         text = io.StringIO(content.decode("utf-8"), newline=None).read()
@@ -447,8 +446,8 @@ def _table(path: Path, content: bytes, changes: Sequence[str]) -> Any:
     return defined(parsed(path, text), changes)
 
 
-def make_config(values: Json, name: str = "config", names: Mapping[str, str] | None = None) -> Config:
-    """Make a job from a dictionary, with the checks and messages of `load_config`.
+def make_config(values: object, name: str = "config", names: Mapping[str, str] | None = None) -> Config:
+    """Make a job from a dictionary, with the checks and messages of `load_config`, which also refuse other objects.
 
     Messages call the job ``name``. ``names`` are the names in messages of keys that the caller calls differently.
     """

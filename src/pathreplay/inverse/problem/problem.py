@@ -341,7 +341,7 @@ def _loaded(
     if given.scene is not None:
         if shots and not set(shots) & {sensor.id() for sensor in given.scene.sensors()}:
             raise PathreplayError(
-                "scene: cameras of a capture are only added to the scene file of a job, and this scene is an object; "
+                "scene: cameras of a capture are only added to the scene file of a job, and this scene is in memory; "
                 "give the name of a file, or 'views' in place of the capture"
             )
         config, differences = completed(config, given.scene, given.integrator)
