@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -45,6 +45,9 @@ MIN_FRACTION = 9 / 32
 BEYOND = 1.5
 """Distance beyond the fixed end at which a suspected crack is probed, in lengths of the final interval. In the square
 of an emitter this distance is less than `emitters.BORDER`."""
+
+
+Direction = TypeVar("Direction", "mi.Vector2f", "mi.Vector3f")
 
 
 @dataclass
@@ -152,7 +155,7 @@ class Bracket:
         return 0.5 * dr.pi * self.weight / (length * density)
 
 
-def crossing_weight(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi.Spectrum:
+def crossing_weight(w: Direction, jump: mi.Spectrum, slope: Direction) -> mi.Spectrum:
     """Return K = jump · sgn(w·∂B) / |∂B|, where ∂B is ``slope`` and w the direction of the segment; 0 if not finite."""
     n = dr.norm(slope)
     K = jump * (dr.sign(dr.dot(w, slope)) / n)

@@ -14,7 +14,7 @@ from pathreplay.adjoint.baseline import Baseline
 from pathreplay.boundary.edges import Edges, edges_backward, edges_forward
 from pathreplay.boundary.primary import PrimarySearch
 from pathreplay.boundary.secondary import SecondarySearch
-from pathreplay.boundary.volumetric import VolumetricSearch
+from pathreplay.boundary.volumetric import ScatteredBeamSearch, VolumetricSearch
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
@@ -145,6 +145,8 @@ class Boundary(Term):
         if self.inner:
             search = SecondarySearch.of(trace, places, INNER_LENGTHS)
             yield search.find(n, max(n // (NARROW_CLOSER if search.most_arcs > 1 else INNER_CLOSER), 1), seed)
+            if trace.media is not None and trace.traits.hard_lights and trace.max_depth > 2:
+                yield ScatteredBeamSearch.of(trace, places, INNER_LENGTHS[1]).find(n, max(n // INNER_CLOSER, 1), seed)
 
 
 def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:

@@ -30,6 +30,8 @@ class Stream(IntEnum):
     SECONDARY_KEYS = 0x2545F491
     VOLUMETRIC_KEYS = 0x3C6EF372
     VOLUMETRIC_CENTRES = 0x1F83D9AB
+    SCATTERED_KEYS = 0x5BE0CD19
+    SCATTERED_CENTRES = 0x6A09E667
     # The key of the stream is a hash of the value and the seed of the pass.
     PARTICLES = 0x68E31DA4
     # The seed of the stream is a hash of the value plus the index of a part, and the seed of the pass.
@@ -52,6 +54,7 @@ class Stream(IntEnum):
     BISECT_PRIMARY = 0
     BISECT_SECONDARY = 1
     BISECT_VOLUMETRIC = 2
+    BISECT_SCATTERED = 3
     # The value is the index of an independent set of Sobol samples of a pixel (`Pass.sobol_sampler`). The interior term
     # uses set 0. The function `pixel_sweep` uses the first `pixel_samples.SETS` sets.
     FLOW = 0x10  # paths for the gradient term `FilmMotion` (`integrators.film.motion`)
