@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +15,9 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.transport.step import repeat_step
 from pathreplay.transport.vertex import Arrival, Step, TraceConfig, VertexRecord
+
+Tangents: TypeAlias = "list[Any]"
+"""One tangent per value, of the value's type."""
 
 
 class Unreached(PathreplayError):
@@ -115,8 +118,8 @@ def forward_step(
     attached: bool,
     tangent: RayDerivative,
     active: mi.Bool,
-    more: Callable[[Step], Sequence[Any]] = lambda step: (),
-) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative, list[Any]]:
+    more: Callable[[Step], Sequence[object]] = lambda step: (),
+) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative, Tangents]:
     """Evaluate the step at vertex i again, with the tangent of the arriving ray.
 
     Returns the step, detached, the tangents of e_i, w_i (see `Step`) and the next ray, and the tangents of the values
@@ -178,7 +181,7 @@ def _attached_ray(ray: mi.Ray3f) -> mi.Ray3f:
     return ray
 
 
-def tangents(*values: Any) -> list[Any]:
+def tangents(*values: object) -> Tangents:
     """Return the tangents of all values, propagated from the parameters in one traversal.
 
     The tangent of a value without gradients is zero.

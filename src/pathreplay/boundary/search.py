@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +21,9 @@ from pathreplay.boundary.edges import Edges, FilmDomain
 from pathreplay.samplers.counter_sampler import ROUNDS
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.vertex import TraceConfig
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 PILOT_RATIO, PILOT_PER_PIXEL = 8, 2
 """Ratio of segments to pilot segments, and the largest number of pilot segments per pixel."""
@@ -86,7 +89,6 @@ class FilmSegment(PlaneSegment):
 
 
 OnFilm = TypeVar("OnFilm", bound=FilmSegment)
-Search = TypeVar("Search", bound="FilmSearch[Any]")
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class FilmSearch(EdgeSearch[OnFilm]):
     length: float
 
     @classmethod
-    def of(cls: type[Search], trace: TraceConfig, film: FilmDomain, length: float) -> Search:
+    def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> Self:
         return cls(trace, film, SegmentDensity.uniform(film.size, 0.0 if film.reflects else length), length)
 
     @abstractmethod

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -45,6 +45,9 @@ from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexSamp
 from pathreplay.transport.volume.media import interaction
 from pathreplay.transport.volume.passage import STEP, is_boundary, skip_null, transmittance_up_to
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 
 @dataclass
 class BeamSegment(FilmSegment):
@@ -65,9 +68,6 @@ class BeamCrossing:
         return self.shadow.gap_at(at, self.active)
 
 
-Beams = TypeVar("Beams", bound="VolumetricSearch")
-
-
 @dataclass(frozen=True)
 class VolumetricSearch(FilmSearch[BeamSegment]):
     """Edge search over film positions and distances.
@@ -78,7 +78,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
     bisection = Stream.BISECT_VOLUMETRIC
 
     @classmethod
-    def of(cls: type[Beams], trace: TraceConfig, film: FilmDomain, length: float) -> Beams:
+    def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> Self:
         return super().of(replace(trace, max_depth=min(trace.max_depth, deepest(trace))), film, length)
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> BeamSegment:
@@ -341,13 +341,12 @@ class ScatteredBeamSearch(EdgeSearch[CameraPath]):
 
     def resolve(self, segments: CameraPath, weight: mi.Float, generator: mi.PCG32) -> Edges:
         layout = Layout.of(self.trace, True)
-        records = dr.alloc_local(record_type(layout), room_for(self.trace))
-        arc, records = self._arc(segments, layout, records)
+        arc, records = self._arc(segments, layout, dr.alloc_local(record_type(layout), room_for(self.trace)))
         crossing, x = arc.resolve(weight, generator), arc.observer.selected
         path = EdgePath(segments.s, segments.key, dr.select(x.active, x.k, 0), x.at.ray, layout, records)
         return Edges(path, [crossing], arc.observer)
 
-    def _arc(self, path: CameraPath, layout: Layout | None, records: Any) -> tuple[BeamArc, Any]:
+    def _arc(self, path: CameraPath, layout: Layout | None, records: object) -> tuple[BeamArc, object]:
         """Draw an arc around a vertex of each path, and record the path unless ``records`` is None."""
         ray, weight = dr.detach(self.film.ray(path.s, path.key))
         trace = replace(self.trace, max_depth=self.trace.max_depth - 1)  # the point of the medium is a vertex, too

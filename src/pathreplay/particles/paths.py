@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -149,7 +148,7 @@ def particle_tangent(
     return film.develop(sums * film.scale(particles.number)), moves
 
 
-def _on_film(film: ParticleFilm, step: Step) -> list[Any]:
+def _on_film(film: ParticleFilm, step: Step) -> list[object]:
     """Return the contribution of a step to the film, and the values of the filter around its position."""
     assert step.splat is not None
     at = film.footprint(step.splat.s)
