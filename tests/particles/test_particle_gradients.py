@@ -489,6 +489,15 @@ def test_edges_in_fog_are_in_the_gradient(cell: Mean) -> None:
     hold_both_modes(cell, cell.spp // 16)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ball, point", "ball, directional", "light moves"])
+def test_beams_that_vertices_see_in_fog_are_in_the_gradient(name: str) -> None:
+    """Of camera paths with up to four segments. Without these beams, the first gradient is 12 % off."""
+    (cell,) = (c for c in FOG_EDGES if c.name == name)
+    z, error = in_expectation(replace(cell, depth=4, peer=PLUGIN), "pathreplay")
+    assert abs(z) < Z_LIMIT and error < RESOLUTION
+
+
 def test_an_occluder_before_fog_is_in_the_gradient() -> None:
     (cell,) = (c for c in FOG_EDGES if c.name == "ball before the camera")
     z, error = in_expectation(replace(cell, peer=PLUGIN, seeds=4, spp=1024))  # no kernels of a peer

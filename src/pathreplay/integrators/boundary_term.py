@@ -47,8 +47,7 @@ class Boundary(Term):
     """The boundary term, for edges visible from the camera, from surfaces or from points in media.
 
     The camera may see an edge directly, in mirrors or through glass. Edges in textures and masks are not
-    differentiated, and neither is the alpha channel. Hard shadows in media are only differentiated where the camera
-    sees them directly.
+    differentiated, and neither is the alpha channel.
     """
 
     film: bool = True  # edges visible from the camera
