@@ -191,8 +191,9 @@ def _distance(
     If the ray leaves the scene, the distances end behind the scene. In media without bounds, they do not end: half of
     them lie behind the scene.
     """
-    box = trace.scene.bbox()
-    far = dr.norm(ray.o - box.center()) + 0.5 * dr.norm(box.extents())
+    # `dr.freeze` would keep the bounding box that the scene had when the pass was recorded.
+    sphere = dr.gather(mi.Vector4f, trace.traits.tables.scene_bounds, mi.UInt32(0))
+    far = dr.norm(ray.o - mi.Point3f(sphere.x, sphere.y, sphere.z)) + sphere.w
     reach = dr.select(hit.is_valid(), hit.t, far)
     τ, pdf = u * reach, dr.rcp(reach)
     if trace.media.bounded:
