@@ -55,7 +55,7 @@ class ShadowTest:
 
     @staticmethod
     def at(trace: TraceConfig, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> ShadowTest:
-        """Test whether the light that ``u`` selects reaches ``x``. With media, only occlusion is tested."""
+        """Test whether the light that ``u`` selects reaches ``x``. At points of a medium, only occlusion is tested."""
         if trace.to_sensor is not None:
             return _test_of_sensor(trace, trace.to_sensor, x, u, active)
         light, Le = draw_emitter(trace.scene, x, u, active, visible=False)
@@ -65,7 +65,7 @@ class ShadowTest:
         if trace.skips_null or trace.media is not None:
             hit = skip_null(trace, ray, hit, lit)
         outside = mi.Bool(False)
-        if trace.media is None:
+        if isinstance(x, mi.SurfaceInteraction3f):
             for projector in trace.traits.projectors:
                 outside |= (light.pdf == 0) & (light.emitter == mi.EmitterPtr(projector))
             for spot in trace.traits.spots:
@@ -129,8 +129,9 @@ class HardShadow:
         It is the transmittance of the shadow ray from the lit point, which starts in ``medium``, less the light that
         passes a half-transparent occluder.
         """
-        T = transmittance_past_edge(trace, self.lit.ray, self.test.hit.t, medium, sampler, active)
         occluded = active & ~self.test.outside & self.test.hit.is_valid()
+        t = dr.select(occluded, self.test.hit.t, 0)  # without an occluder, the ray need not be split
+        T = transmittance_past_edge(trace, self.lit.ray, t, medium, sampler, active)
         si = self.test.hit.compute_surface_interaction(self.test.ray, compat.shading(), occluded)
         passes = si.bsdf(self.test.ray).eval_null_transmission(si, occluded)
         return T * dr.select(occluded, 1 - passes, 1)

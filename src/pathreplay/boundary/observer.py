@@ -23,6 +23,7 @@ from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import place_met, shape_met
 from pathreplay.transport.start import CameraStart, behind_emitters
 from pathreplay.transport.surface import met
+from pathreplay.transport.velocity import moved_direction
 from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, is_smooth
 from pathreplay.transport.volume.media import carried, span
 from pathreplay.transport.volume.passage import (
@@ -227,6 +228,19 @@ class ObserverVertex:
         shape = shape_met(self.trace, hit, ray, active)
         seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
         return active & (~self.event | seen)
+
+    def moved_ray(
+        self, at: mi.Interaction3f, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+    ) -> mi.Ray3f:
+        """Return ``ray``, from the vertex to ``hit``, with the derivatives that it has in the interior term.
+
+        It is differentiable in ``at``, the vertex (see `moved`), and in the shape that was hit.
+        """
+        holds = self.holds(hit, ray, active)
+        d, _ = moved_direction(self.trace.traits.tables.blend_lengths, at, ray.d, hit, holds)
+        moved = mi.Ray3f(ray)
+        moved.o, moved.d = at.spawn_ray(dr.detach(d)).o, d
+        return moved
 
     def hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         return meet(self.trace, ray, active)

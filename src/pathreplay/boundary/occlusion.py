@@ -26,7 +26,7 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import edge_normal, mixed, place_met, shape_met, turned_away
-from pathreplay.transport.velocity import held_direction, jumps_at_facets, moved_direction
+from pathreplay.transport.velocity import held_direction, jumps_at_facets
 from pathreplay.transport.volume.passage import SHORT_OF
 
 
@@ -230,7 +230,6 @@ class MovedSide:
 
         At a crease, B is `OcclusionEdge.crease_gap` divided by `OcclusionEdge.slope`.
         """
-        e, hit, lengths = self.edge, self.side.hit, self.edge.observer.trace.traits.tables.blend_lengths
-        d, _ = moved_direction(lengths, at, self.side.ray.d, hit, e.observer.holds(hit, self.side.ray, e.active))
-        ray = mi.Ray3f(at.spawn_ray(dr.detach(d)).o, d)
-        return dr.select(e.active, dr.select(e.is_crease, e.crease_gap(ray, at.n) / e.slope, dr.dot(e.n, d)), 0)
+        e = self.edge
+        ray = e.observer.moved_ray(at, self.side.ray, self.side.hit, e.active)
+        return dr.select(e.active, dr.select(e.is_crease, e.crease_gap(ray, at.n) / e.slope, dr.dot(e.n, ray.d)), 0)

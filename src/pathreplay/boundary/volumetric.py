@@ -1,5 +1,7 @@
 """Volumetric boundary term: boundaries of the hard shadows that lights without extent cast into media.
 
+On light paths, the sensor takes the place of the light (see `emission`).
+
 The camera sees points x = o + τ d of a medium at all distances τ. Each x is either lit or in shadow. For each τ, the
 boundary of the shadow is an edge on the film. Short segments with constant τ find this edge (see `crofton`):
 
@@ -26,13 +28,12 @@ import mitsuba as mi
 from pathreplay.adjoint.autodiff import derivative_by_place, derivative_by_ray
 from pathreplay.adjoint.record import Layout, deepest, record, record_type, room_for
 from pathreplay.boundary.arcs import Arc
-from pathreplay.boundary.crofton import VisibilityProbe, bisect, crossing_weight, detect, heading
+from pathreplay.boundary.crofton import VisibilityProbe, bisect, crossing_weight, detect, heading, probe_positions
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
 from pathreplay.boundary.hard_shadows import HardShadow, ShadowTest
 from pathreplay.boundary.observer import ObserverVertex, SelectedVertex, choose_vertex
 from pathreplay.boundary.search import EdgeSearch, FilmSearch, FilmSegment, SegmentDensity
 from pathreplay.boundary.secondary import CameraPath
-from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.meet import meet
@@ -40,7 +41,6 @@ from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.step import choose_step
 from pathreplay.transport.surface import met
-from pathreplay.transport.velocity import moved_direction
 from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexSamples
 from pathreplay.transport.volume.media import interaction
 from pathreplay.transport.volume.passage import STEP, is_boundary, skip_null, transmittance_up_to
@@ -48,12 +48,16 @@ from pathreplay.transport.volume.passage import STEP, is_boundary, skip_null, tr
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+NEAR = 0.4
+"""Probability of the part of the density of distances from a vertex that favours small distances: `Distance.draw`."""
+
 
 @dataclass
 class BeamSegment(FilmSegment):
     """A segment on the film, at one distance τ along all its camera rays."""
 
     τ: mi.Float
+    relevance: mi.Float
 
 
 @dataclass
@@ -86,23 +90,22 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         sampler = CounterSampler.stream(key, Stream.BEAM)
         w = heading(sampler.next_1d())
         c, density = self.density.draw(*quasi_random(i, n, Stream.VOLUMETRIC_CENTRES.of(seed)))
-        ray = dr.detach(self.film.ray(c, key)[0])
-        τ, pdf = _distance(self.trace, ray, self._hit(ray, mi.Bool(True)), sampler.next_1d())
-        ok = dr.isfinite(τ) & (pdf > 0)
-        density = density * dr.select(ok, pdf, 1)
-        return BeamSegment(c, w, mi.Float(self.length), key, density, ok, dr.select(ok, τ, 0))
+        rays = [dr.detach(self.film.ray(c + t * w, key)[0]) for t in probe_positions(mi.Float(self.length))]
+        hits = [self._hit(ray, mi.Bool(True)) for ray in rays]
+        along = Distance.draw(self.trace, rays[-1].o, hits, sampler.next_1d(), near=0)
+        density = density * dr.select(along.ok, along.pdf, 1)
+        return BeamSegment(c, w, mi.Float(self.length), key, density, along.ok, along.τ, along.relevance)
+
+    def detect(self, segments: BeamSegment) -> mi.Float:
+        return segments.relevance * super().detect(segments)
 
     def probe(self, segment: BeamSegment, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        visible, test = self._shadow_test(segment, t, active)
-        return VisibilityProbe.of(dr.select(visible, mi.UInt32(1), 0) | dr.select(test.dark, mi.UInt32(2), 0))
+        return _probe(*self._shadow_test(segment, t, active))
 
     def _shadow_test(self, segment: BeamSegment, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, ShadowTest]:
         """Return whether the camera sees the medium point at position ``t``, and the shadow test of that point."""
         ray = dr.detach(self.film.ray(segment.at(t), segment.key)[0])
-        hit = self._hit(ray, active)
-        visible = active & ~(hit.is_valid() & (hit.t < segment.τ))
-        u = CounterSampler.stream(segment.key, Stream.BEAM_EMITTER).next_2d()
-        return visible, ShadowTest.at(self.trace, _point_on(ray, segment.τ), u, visible)
+        return _shadow_test(self.trace, ray, segment.τ, self._hit(ray, active), segment.key, active)
 
     def edge(self, segment: BeamSegment, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
         (visible_a, test_a), (visible_b, test_b) = (self._shadow_test(segment, t, active) for t in (a, b))
@@ -169,11 +172,15 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
             path = onward
             count += 1
         active = active & flight.event
-        σ_s, _, _ = at.medium.get_scattering_coefficients(interaction(at.medium, at.ray, flight.t), active)
-        flight.σ_s = dr.detach(σ_s)
-        x = SelectedVertex(at, k, k, flight.σ_s, mi.Float(1), mi.Bool(True), active, flight)
         edge_path = EdgePath(s, segment.key, dr.select(active, k, 0), at.ray, layout, records)
-        return edge_path, ObserverVertex(trace, x)
+        return edge_path, _collision(trace, at, k, flight, active)
+
+
+def _collision(trace: TraceConfig, at: Arrival, k: mi.UInt32, flight: Flight, active: mi.Bool) -> ObserverVertex:
+    """Return the observer at the end of a ``flight``, with ``k`` vertices before it."""
+    σ_s, _, _ = at.medium.get_scattering_coefficients(interaction(at.medium, at.ray, flight.t), active)
+    flight.σ_s = dr.detach(σ_s)
+    return ObserverVertex(trace, SelectedVertex(at, k, k, flight.σ_s, mi.Float(1), mi.Bool(True), active, flight))
 
 
 def _point_on(ray: mi.Ray3f, τ: mi.Float) -> mi.Interaction3f:
@@ -183,81 +190,111 @@ def _point_on(ray: mi.Ray3f, τ: mi.Float) -> mi.Interaction3f:
     return x
 
 
-def _distance(
-    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, u: mi.Float
-) -> tuple[mi.Float, mi.Float]:
-    """Sample a distance τ along a ray, up to its ``hit``; return it with its density.
+@dataclass
+class Distance:
+    """A sampled distance along a ray."""
 
-    If the ray leaves the scene, the distances end behind the scene. In media without bounds, they do not end: half of
-    them lie behind the scene.
-    """
-    # `dr.freeze` would keep the bounding box that the scene had when the pass was recorded.
-    sphere = dr.gather(mi.Vector4f, trace.traits.tables.scene_bounds, mi.UInt32(0))
-    far = dr.norm(ray.o - mi.Point3f(sphere.x, sphere.y, sphere.z)) + sphere.w
-    reach = dr.select(hit.is_valid(), hit.t, far)
-    τ, pdf = u * reach, dr.rcp(reach)
-    if trace.media.bounded:
-        return τ, pdf
-    beyond = far * u / (1 - u)
-    pdf_beyond = far / dr.square(far + beyond)
-    return dr.select(hit.is_valid(), τ, beyond), dr.select(hit.is_valid(), pdf, pdf_beyond)
+    τ: mi.Float
+    pdf: mi.Float
+    relevance: mi.Float  # factor of the importance of edges; small far behind the scene
+
+    @staticmethod
+    def draw(
+        trace: TraceConfig, o: mi.Point3f, hits: list[mi.PreliminaryIntersection3f], u: mi.Float, near: float
+    ) -> Distance:
+        """Sample a distance for rays from ``o``, up to the farthest of their first ``hits``.
+
+        The part of the density of probability ``near`` is proportional to 1 / √τ, because |∂B/∂s| is proportional to τ
+        for small τ. The rest of the density is constant. If a ray leaves the scene, the distances end behind the scene
+        or, in media without bounds, have no end.
+        """
+        # `dr.freeze` would keep the bounding box that the scene had when the pass was recorded.
+        sphere = dr.gather(mi.Vector4f, trace.traits.tables.scene_bounds, mi.UInt32(0))
+        far = dr.norm(o - mi.Point3f(sphere.x, sphere.y, sphere.z)) + sphere.w
+        reach, leaves = mi.Float(0), mi.Bool(False)
+        for hit in hits:
+            reach = dr.maximum(reach, dr.select(hit.is_valid(), hit.t, far))
+            leaves |= ~hit.is_valid()
+        leaves &= not trace.media.bounded or trace.media.around is not None
+        v = dr.minimum((u - near) / (1 - near), dr.one_minus_epsilon(mi.Float))
+        τ = dr.select(leaves, far * v / (1 - v), reach * v)
+        if near:
+            τ = dr.select(u < near, reach * dr.square(u / near), τ)
+        pdf = (1 - near) * dr.select(leaves, far / dr.square(far + τ), dr.rcp(reach))
+        pdf += dr.select(τ < reach, 0.5 * near * dr.rsqrt(τ * reach), 0)
+        ok = dr.isfinite(τ) & (τ > 0) & dr.isfinite(pdf)
+        return Distance(dr.select(ok, τ, 0), dr.select(ok, pdf, 0), dr.select(ok, dr.minimum(1, dr.square(far / τ)), 0))
+
+    @property
+    def ok(self) -> mi.Bool:
+        """Whether the distance was sampled."""
+        return self.pdf > 0
+
+
+def _shadow_test(
+    trace: TraceConfig, ray: mi.Ray3f, τ: mi.Float, hit: mi.PreliminaryIntersection3f, key: mi.UInt32, active: mi.Bool
+) -> tuple[mi.Bool, ShadowTest]:
+    """Return whether the medium point at distance ``τ`` lies before the first ``hit``, and its shadow test."""
+    visible = active & ~(hit.is_valid() & (hit.t < τ))
+    u = CounterSampler.stream(key, Stream.BEAM_EMITTER).next_2d()
+    return visible, ShadowTest.at(trace, _point_on(ray, τ), u, visible)
+
+
+def _probe(visible: mi.Bool, test: ShadowTest) -> VisibilityProbe:
+    return VisibilityProbe.of(dr.select(visible, mi.UInt32(1), 0) | dr.select(test.dark, mi.UInt32(2), 0))
 
 
 class BeamArc(Arc):
     """An arc of directions around a vertex, with points of a medium at one distance τ along all directions."""
 
     @cached_property
-    def distance(self) -> tuple[mi.Float, mi.Float]:
-        """Distance τ and its density."""
-        ray = self.observer.origin.spawn_ray(self.c)
-        u = CounterSampler.stream(self.key, Stream.BEAM).next_1d()
-        return _distance(self.observer.trace, ray, self._hit(ray, self.active), u)
+    def distance(self) -> Distance:
+        u, observer = CounterSampler.stream(self.key, Stream.BEAM).next_1d(), self.observer
+        rays = [observer.origin.spawn_ray(self.at(t)) for t in probe_positions(self.length)]
+        return Distance.draw(observer.trace, observer.origin.p, [self._hit(ray, self.active) for ray in rays], u, NEAR)
 
     def _hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         return self.observer.behind(ray, self.observer.hit(ray, active), active)
 
     def probe(self, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        visible, test = self._shadow_test(t, active)
-        return VisibilityProbe.of(dr.select(visible, mi.UInt32(1), 0) | dr.select(test.dark, mi.UInt32(2), 0))
+        return _probe(*self._shadow_test(t, active))
 
     def _shadow_test(self, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, ShadowTest]:
         """Return whether the vertex sees the medium point at position ``t``, and the shadow test of that point."""
-        ray, τ = self.observer.origin.spawn_ray(self.at(t)), self.distance[0]
+        ray = self.observer.origin.spawn_ray(self.at(t))
         active = active & self.observer.may_scatter(ray.d)
-        hit = self._hit(ray, active)
-        visible = active & ~(hit.is_valid() & (hit.t < τ))
-        u = CounterSampler.stream(self.key, Stream.BEAM_EMITTER).next_2d()
-        return visible, ShadowTest.at(self.observer.trace, _point_on(ray, τ), u, visible)
+        return _shadow_test(self.observer.trace, ray, self.distance.τ, self._hit(ray, active), self.key, active)
 
     def importance_of_edges(self) -> mi.Float:
         """Estimate the importance of a shadow boundary that crosses this arc."""
-        presence = detect(self.probe, self.length, self.active) * self.importance() / self.distance[1]
-        return dr.select(self.active, presence * dr.mean(dr.abs(self.observer.selected.β * self.f)) / self.p, 0)
+        active = self.active & self.distance.ok
+        presence = detect(self.probe, self.length, active) * self.importance() * self.distance.relevance
+        light = dr.mean(dr.abs(self.observer.selected.β * self.f)) / (self.p * self.distance.pdf)
+        return dr.select(active, presence * light, 0)
 
     def resolve(self, weight: mi.Float, generator: mi.PCG32) -> ScatteredBeam:
         """Locate the shadow boundary by bisection, and compute its weight K: see `EdgeSearch.resolve`."""
-        x, trace, (τ, pdf_τ) = self.observer, self.observer.trace, self.distance
+        x, trace, τ = self.observer, self.observer.trace, self.distance.τ
         bracket = bisect(self.probe, self.length, dr.select(self.active, weight, 0), generator)
-        active = bracket.weight > 0
+        active = (bracket.weight > 0) & self.distance.ok
         (seen_a, test_a), (seen_b, test_b) = (self._shadow_test(t, active) for t in (bracket.a, bracket.b))
         shadow = HardShadow.between(trace, test_a, test_b, active & seen_a & seen_b)
         active = shadow.exists & shadow.lit.lit
         d_a, d_b = self.at(bracket.a), self.at(bracket.b)
         ray = x.origin.spawn_ray(dr.select(shadow.in_a, d_a, d_b))
-        first, medium = x.hit(ray, active), x.medium(ray.d)
-        y, entry = _observer_at(trace, ray, first, τ, medium, active)
+        first, sampler = x.hit(ray, active), CounterSampler.stream(self.key, Stream.TRANSMITTANCE_OF_BEAM)
+        T, medium = transmittance_up_to(trace, ray, τ, x.medium(ray.d), sampler, active)
+        y, entry, before = _observer_at(trace, ray, first, τ, medium, active & dr.any(T != 0))
         active = y.active & y.at.medium.use_emitter_sampling()
-        sampler = CounterSampler.stream(self.key, Stream.TRANSMITTANCE_OF_BEAM)
-        T, _ = transmittance_up_to(trace, ray, τ, medium, sampler, active)
         T *= shadow.blocked(trace, y.at.medium, sampler, active)
         f, pdf = x.towards(ray.d, active)
         f *= T * y.selected.β * y.towards(shadow.lit.ray.d, active)[0] * shadow.lit.Le
-        per_length = 0.5 * dr.pi * bracket.weight * self.weight(pdf, active) / pdf_τ
+        per_length = 0.5 * dr.pi * bracket.weight * self.weight(pdf, active) / self.distance.pdf
         jump = dr.select(shadow.in_a, -1, 1) * x.selected.β * f * per_length
         slope = derivative_by_ray(ray, lambda ray: shadow.gap_at(_point_on(ray, τ), active)).d
         slope -= dr.dot(slope, ray.d) * ray.d
         K = crossing_weight(d_b - d_a, dr.select(active, jump, 0), slope)
-        return ScatteredBeam(K, shadow, x, ray, first, entry, y)
+        return ScatteredBeam(K, shadow, x, ray, first, entry, before, y)
 
 
 @dataclass
@@ -270,16 +307,15 @@ class ScatteredBeam:
     ray: mi.Ray3f  # from x to the point of the medium
     first: mi.PreliminaryIntersection3f  # first hit of the ray
     entry: mi.PreliminaryIntersection3f  # last null boundary before the point; invalid if there is none
+    before: mi.Float  # distance along the ray from which ``entry`` is the first hit
     y: ObserverVertex  # the point of the medium
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        active, trace = self.y.active, self.x.trace
-        holds = self.x.holds(self.first, self.ray, active)
-        d, _ = moved_direction(trace.traits.tables.blend_lengths, at, self.ray.d, self.first, holds)
-        ray = mi.Ray3f(self.ray)
-        ray.o, ray.d = at.spawn_ray(dr.detach(d)).o, d
-        passed = active & self.entry.is_valid()
-        ray.o = dr.select(passed, met(self.entry, ray, passed).p, ray.o)
+        active = self.y.active
+        ray, passed = self.x.moved_ray(at, self.ray, self.first, active), active & self.entry.is_valid()
+        start = mi.Ray3f(ray)
+        start.o = ray.o + self.before * ray.d
+        ray.o = dr.select(passed, met(self.entry, start, passed).p, ray.o)
         return self.shadow.gap_at(self.y.moved(ray), active)
 
 
@@ -291,33 +327,28 @@ def _observer_at(
     τ: mi.Float,
     medium: mi.MediumPtr,
     active: mi.Bool,
-) -> tuple[ObserverVertex, mi.PreliminaryIntersection3f]:
-    """Return the observer at distance ``τ`` along a ray that starts in ``medium``, and the last null boundary before.
+) -> tuple[ObserverVertex, mi.PreliminaryIntersection3f, mi.Float]:
+    """Return the observer at distance ``τ`` along a ray, which is in ``medium`` there.
 
-    ``first`` is the first hit of the ray.
+    Also returns the last null boundary before the observer, and the distance along the ray from which this boundary is
+    the first hit. ``first`` is the first hit of the ray.
     """
     here, entry, onward = mi.PreliminaryIntersection3f(first), dr.zeros(mi.PreliminaryIntersection3f), mi.Ray3f(ray)
     entry.t = mi.Float(dr.inf)
-    medium, gone = mi.MediumPtr(medium), mi.Float(0)
+    gone, before = mi.Float(0), mi.Float(0)
     passing = active & (here.t < τ) & is_boundary(trace, here, ray, active)
     while dr.hint(passing, exclude=[trace, ray, τ], label="pathreplay: to a point of a medium"):
-        si = here.compute_surface_interaction(onward, compat.minimal(), passing)
-        medium = dr.select(si.is_medium_transition(), si.target_medium(ray.d), medium)
-        entry = mi.PreliminaryIntersection3f(here)
-        entry.t = gone + here.t
-        gone = entry.t + STEP * (1 + dr.max(dr.abs(ray.o)) + entry.t)
+        entry, before = mi.PreliminaryIntersection3f(here), mi.Float(gone)
+        gone += here.t
+        gone += STEP * (1 + dr.max(dr.abs(ray.o)) + gone)
         onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
         here = meet(trace, onward, passing)
         passing &= (gone + here.t < τ) & is_boundary(trace, here, onward, passing)
     active = active & (medium != None) & (gone < τ)  # noqa: E711 (an array of pointers)
     flight = Flight.none(trace.media)
     flight.event, flight.t = active, τ - gone
-    σ_s, _, _ = medium.get_scattering_coefficients(interaction(medium, onward, flight.t), active)
-    flight.σ_s = dr.detach(σ_s)
     at = Arrival(onward, here, mi.Float(1), mi.Bool(False), mi.Bool(False), medium, mi.Float(0))
-    zero = mi.UInt32(0)
-    y = SelectedVertex(at, zero, zero, flight.σ_s, mi.Float(1), mi.Bool(True), active, flight)
-    return ObserverVertex(trace, y), entry
+    return _collision(trace, at, mi.UInt32(0), flight, active), entry, before
 
 
 @dataclass(frozen=True)

@@ -93,9 +93,11 @@ class ParticleBoundary(Term):
 
     def notes(self, trace: TraceConfig) -> Iterator[str]:
         """Yield what the term leaves out in a scene."""
-        if self.particles.max_depth > 2 + self.particles.caustics:
-            after = "its first rough surface" if trace.media is None else "its first rough surface or collision"
-            yield f"edges that light meets after {after}"
+        if trace.media is not None and self.particles.max_depth > 2:
+            yield "edges that light meets after its first rough surface or collision"
+            yield "edges between the sensor and points of a medium behind a mirror or glass"
+        elif self.particles.max_depth > 2 + self.particles.caustics:
+            yield "edges that light meets after its first rough surface"
         yield from (
             f"edges in the light of emitter '{each.id()}'" for each in trace.scene.emitters() if has_jumps(each)
         )
