@@ -48,10 +48,11 @@ def test_no_selection_changes_the_mean(shares: list[float]) -> None:
 
 
 def test_paths_end_where_null_boundaries_fill_the_record() -> None:
-    """Twelve shells around the camera and a wall: a path crosses more of them than its record holds."""
+    """24 shells around the camera, and a wall: a path crosses more of them than its record holds."""
+    fog = {"type": "homogeneous", "sigma_t": 1e-3}
     shells = {
         f"shell {k}": {"type": "sphere", "radius": 1 + 0.1 * k, "bsdf": {"type": "null"}, "interior": fog}
-        for k, fog in enumerate([{"type": "homogeneous", "sigma_t": 1e-3}] * 24)
+        for k in range(24)
     }
     wall = {
         "type": "rectangle",

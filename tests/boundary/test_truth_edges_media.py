@@ -16,9 +16,9 @@ from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from truth import ROWS, TRANSPOSE_MAX, Bench, Row
 
-FEW = ("fog_shadow", "by_ball_chance", "indirect", "indirect_box")
-"""Cells that say most in a minute: shadows, lamps that are found by chance behind a boundary, and hard shadows in
-indirect light."""
+FEW = ("fog_shadow", "by_ball_chance", "spot_border", "indirect", "indirect_box")
+"""Cells that say most in a minute: shadows, lamps that are found by chance behind a boundary, the border of a spot
+light, and hard shadows in indirect light."""
 
 
 @contextmanager

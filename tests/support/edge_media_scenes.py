@@ -152,6 +152,13 @@ def indirect_in_smoke(box: bool = False) -> dict:
     return {**parts, "fog": smoke, "camera": {**parts["camera"], "medium": FOG}}
 
 
+def spot_in_smoke() -> dict:
+    """The sharp border of a spot light on a wall, through smoke that does not scatter."""
+    place = T().look_at([0.6, 0.4, 2.5], [0.1, 0.1, 0], [0, 1, 0])
+    spot = {"type": "spot", "to_world": place, "cutoff_angle": 8, "beam_width": 8, "intensity": rgb(12, 10, 8)}
+    return in_fog({"type": "homogeneous", "sigma_t": 0.1, "albedo": 0.0}, wall=shape(BACK, plain()), lamp=spot)
+
+
 def media_cell(name: str, make: Callable[[], dict], key: str, move: Move, depth: int = 3, **more: Any) -> Case:
     return cell(name, make, key, move, depth, **{"reference": "volpath", "spp": 128, **more})
 
@@ -172,6 +179,7 @@ CELLS = [
     media_cell("shadow_chance", lambda: shadow_in_fog(lambda: lamp(NEAR, 4), **BY_CHANCE)(), OBJECT, grow, 2),
     media_cell("by_ball", lamp_by_a_ball, "lamp.to_world", translate(-1, 0, 0), 2),
     media_cell("fog_mirror", mirror_in_fog, "mirror.to_world", translate(0, 0, 1)),
+    media_cell("spot_border", spot_in_smoke, "lamp.to_world", translate(1, 0.3, 0), 2),
     media_cell("indirect", indirect_in_smoke, OBJECT, translate(1, 0.3, 0.4), spp=256, seeds=24),
     media_cell("indirect_box", partial(indirect_in_smoke, True), OBJECT, translate(1, 0.3, 0.4), spp=256, seeds=24),
 ]

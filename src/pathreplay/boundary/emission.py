@@ -1,4 +1,4 @@
-"""Boundary term of light paths: edges between an emitter and the first rough surface, and before the sensor.
+"""Boundary term of light paths: edges before the first rough surface or collision, and between it and the sensor.
 
 The random numbers of the first ray of a light path take the place of the film position in `primary`. Let f(u) be the
 contribution to the image of a light path whose first ray has the random numbers u. Two of these numbers vary, the
