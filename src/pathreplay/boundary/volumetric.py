@@ -348,6 +348,8 @@ def _observer_at(
     flight = Flight.none(trace.media)
     flight.event, flight.t = active, τ - gone
     at = Arrival(onward, here, mi.Float(1), mi.Bool(False), mi.Bool(False), medium, mi.Float(0))
+    if trace.without_caustics:
+        at.scattered = mi.Bool(True)
     return _collision(trace, at, mi.UInt32(0), flight, active), entry, before
 
 
