@@ -156,12 +156,19 @@ def test_an_album_keeps_arrays_of_all_sizes_apart(tmp_path: Path, monkeypatch: p
     assert store._file is not None and os.fstat(store._file.fileno()).st_size < 3 * most
 
 
-def test_an_album_tells_of_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*arguments: Any, **options: Any) -> Any:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [
+        (errno.ENOSPC, r"No space left in .* set TMPDIR to a folder on another disk"),
+        (errno.EROFS, r"cannot be kept on disk \(Read-only.*\); set TMPDIR to a folder"),
+    ],
+)
+def test_an_album_tells_why_it_cannot_write(number: int, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*arguments: Any, **options: Any) -> Any:
+        raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr("tempfile.TemporaryFile", full)
-    with pytest.raises(PathreplayError, match=r"No space left in .* set TMPDIR to a folder on another disk"):
+    monkeypatch.setattr("tempfile.TemporaryFile", fails)
+    with pytest.raises(PathreplayError, match=message):
         DiskStore(room=0).keep(array(300, 200, 3))
 
 
@@ -169,15 +176,6 @@ def test_a_disk_store_needs_no_tmpdir(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", "/nowhere")
     picture = array(300, 200, 3)
     np.testing.assert_array_equal(DiskStore(room=0).keep(picture), picture)
-
-
-def test_a_disk_store_tells_that_no_folder_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    def read_only(*arguments: Any, **options: Any) -> Any:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-    monkeypatch.setattr("tempfile.TemporaryFile", read_only)
-    with pytest.raises(PathreplayError, match=r"cannot be kept on disk \(Read-only.*\); set TMPDIR to a folder"):
-        DiskStore(room=0).keep(array(300, 200, 3))
 
 
 def test_tensor_files_are_those_of_the_library() -> None:

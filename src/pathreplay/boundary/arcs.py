@@ -25,6 +25,7 @@ from typing import TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.boundary.crofton import Bracket
 from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
@@ -82,6 +83,15 @@ class Arc:
 
     def at(self, t: mi.Float) -> mi.Vector3f:
         return self.c * dr.cos(t) + self.w * dr.sin(t)
+
+    @property
+    def light(self) -> mi.Float:
+        """The throughput of the sampled direction, divided by its density."""
+        return dr.select(self.active, dr.mean(dr.abs(self.observer.selected.β * self.f)) / self.p, 0)
+
+    def per_length(self, bracket: Bracket, pdf: mi.Float, active: mi.Bool) -> mi.Float:
+        """Return the number of crossings of a bracket times π/2 / (l p(c)): see `Bracket.per_length` and `weight`."""
+        return 0.5 * dr.pi * bracket.weight * self.weight(pdf, active)
 
     def weight(self, pdf: mi.Float, active: mi.Bool) -> mi.Float:
         """Return the weight of an edge; ``pdf`` is the BSDF's density in the direction at which it crosses the arc."""

@@ -92,7 +92,7 @@ class ArcSegment(Arc):
 
     def detect(self) -> Importance:
         """Estimate the importance of an edge that crosses this arc."""
-        light = dr.select(self.active, dr.mean(dr.abs(self.observer.selected.β * self.f)) / self.p, 0)
+        light = self.light
         a, b, c = probe_positions(self.length)
         survey = Survey.of([self.probe(t, self.active) for t in (a, b, c)], self.active)
         survey.presence *= self.importance()
@@ -130,8 +130,7 @@ class ArcSegment(Arc):
         """
         observer, trace, x, active = self.observer, self.observer.trace, self.observer.selected, edge.active
         f, pdf = observer.towards(far.ray.d, active)
-        per_length = 0.5 * dr.pi * bracket.weight * self.weight(pdf, active)
-        common = x.β * f * per_length
+        common = x.β * f * self.per_length(bracket, pdf, active)
         active = active & dr.any(common != 0)
         at_near, at_far = (observer.arrival(side.ray, side.hit, pdf) for side in (near, far))
         arrivals = off_contact(trace, at_near, at_far, active)

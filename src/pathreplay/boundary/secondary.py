@@ -54,6 +54,20 @@ class CameraPath:
     key: mi.UInt32  # seed of the path's random numbers
     number: mi.UInt32  # the segment that the lane bisects: 0 for the segment in the square, i for the i-th arc
 
+    def vertex(
+        self, trace: TraceConfig, film: FilmDomain, shares: mi.Float, layout: Layout | None, records: Any
+    ) -> tuple[Any, SelectedVertex]:
+        """Select a vertex of each path (see `choose_vertex`), and record the path unless ``records`` is None."""
+        ray, weight = dr.detach(film.ray(self.s, self.key))
+        sampler = CounterSampler.of(self.key)
+        records, x = choose_vertex(trace, sampler, ray, film.flows(self.s), shares, layout, records)
+        x.β *= weight / self.density
+        return records, x
+
+    def to_edge(self, x: SelectedVertex, layout: Layout, records: Any) -> EdgePath:
+        """Return the recorded path to the vertex ``x``."""
+        return EdgePath(self.s, self.key, dr.select(x.active, x.k, 0), x.at.ray, layout, records)
+
 
 @dataclass(frozen=True)
 class SecondarySearch(EdgeSearch[CameraPath]):
@@ -120,23 +134,14 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     def resolve(self, segments: CameraPath, weight: mi.Float, generator: mi.PCG32) -> Edges:
         layout = Layout.of(self.trace, True)
         records = dr.alloc_local(record_type(layout), room_for(self.trace))
-        records, x = self._vertex(segments, layout, records)
+        records, x = segments.vertex(self.trace, self.film, self.shares, layout, records)
         x.active &= weight > 0
         observer = ObserverVertex(self.trace, x)
         on_arc = segments.number > 0
         shadow = self._square(observer, segments.key).resolve(dr.select(on_arc, 0, weight), generator)
         arc = self._arc(observer, segments.key, segments.number)
         sides = arc.resolve(dr.select(on_arc, weight / self._arc_count(observer), 0), generator)
-        path = EdgePath(segments.s, segments.key, dr.select(x.active, x.k, 0), x.at.ray, layout, records)
-        return Edges(path, [*sides, shadow], observer)
-
-    def _vertex(self, path: CameraPath, layout: Layout | None, records: Any) -> tuple[Any, SelectedVertex]:
-        """Select a vertex of each camera path, and record the path unless ``records`` is None."""
-        ray, weight = dr.detach(self.film.ray(path.s, path.key))
-        sampler, flows = CounterSampler.of(path.key), self.film.flows(path.s)
-        records, x = choose_vertex(self.trace, sampler, ray, flows, self.shares, layout, records)
-        x.β *= weight / path.density
-        return records, x
+        return Edges(segments.to_edge(x, layout, records), [*sides, shadow], observer)
 
     @property
     def most_arcs(self) -> int:
@@ -159,7 +164,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
 
     def _importances(self, path: CameraPath) -> Importances:
         """Estimate the importance of all segments."""
-        _, x = self._vertex(path, None, None)
+        _, x = path.vertex(self.trace, self.film, self.shares, None, None)
         observer, n = ObserverVertex(self.trace, x), dr.width(path.key)
         none = dr.zeros(mi.Float, n)
         path.density += none  # broadcast to the number of paths

@@ -31,7 +31,7 @@ from pathreplay.boundary.arcs import Arc
 from pathreplay.boundary.crofton import VisibilityProbe, bisect, crossing_weight, detect, heading, probe_positions
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
 from pathreplay.boundary.hard_shadows import HardShadow, ShadowTest
-from pathreplay.boundary.observer import ObserverVertex, SelectedVertex, choose_vertex
+from pathreplay.boundary.observer import ObserverVertex, SelectedVertex
 from pathreplay.boundary.search import EdgeSearch, FilmSearch, FilmSegment, SegmentDensity
 from pathreplay.boundary.secondary import CameraPath
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
@@ -112,8 +112,10 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         shadow = HardShadow.between(self.trace, test_a, test_b, active & visible_a & visible_b)
         s = segment.at(dr.select(shadow.in_a, a, b))
         ray, weight = dr.detach(self.film.ray(s, segment.key))
-        path, observer = self._particle(s, ray, segment, shadow.exists & shadow.lit.lit)
-        jump = weight * dr.select(shadow.in_a, -1, 1) * self._radiance(ray, segment, observer, shadow)
+        active = shadow.exists & shadow.lit.lit
+        medium = self.film.medium(self.trace, ray, active)
+        path, observer = self._particle(s, ray, medium, segment, active)
+        jump = weight * dr.select(shadow.in_a, -1, 1) * self._radiance(ray, medium, segment, observer, shadow)
         return Edges(path, [BeamCrossing(dr.select(observer.active, jump, 0), shadow, observer.active)], observer)
 
     def slope(self, segment: BeamSegment, edges: Edges) -> mi.Vector2f:
@@ -121,9 +123,14 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         return derivative_by_place(path.s, lambda s: crossing.gap(_point_on(self.film.ray(s, path.key)[0], segment.τ)))
 
     def _radiance(
-        self, ray: mi.Ray3f, segment: BeamSegment, observer: ObserverVertex, shadow: HardShadow
+        self,
+        ray: mi.Ray3f,
+        medium: mi.MediumPtr,
+        segment: BeamSegment,
+        observer: ObserverVertex,
+        shadow: HardShadow,
     ) -> mi.Spectrum:
-        """Estimate f, the radiance that the lit medium point scatters to the camera.
+        """Estimate f, the radiance that the lit medium point scatters to the camera. ``ray`` starts in ``medium``.
 
         It is zero if the medium does not use emitter sampling, or if paths are too short to be scattered.
         """
@@ -132,9 +139,8 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         if link is None:
             active &= observer.at.medium.use_emitter_sampling() & (trace.max_depth > 1)
         sampler = CounterSampler.stream(segment.key, Stream.TRANSMITTANCE_OF_BEAM)
-        T = transmittance_up_to(trace, ray, segment.τ, self.film.medium(trace, ray, active), sampler, active)[0]
-        T *= shadow.blocked(trace, observer.at.medium, sampler, active)
-        f = T * observer.selected.β * observer.towards(shadow.lit.ray.d, active)[0] * shadow.lit.Le
+        T = transmittance_up_to(trace, ray, segment.τ, medium, sampler, active)[0]
+        f = T * _scattered(observer, shadow, sampler, active)
         if link is not None and link.adjoint is not None:
             f *= link.adjoint(shadow.lit.uv, ray.wavelengths, active)
         return dr.select(active, f, 0)
@@ -145,14 +151,14 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
 
     @dr.syntax
     def _particle(
-        self, s: mi.Point2f, ray: mi.Ray3f, segment: BeamSegment, active: mi.Bool
+        self, s: mi.Point2f, ray: mi.Ray3f, medium: mi.MediumPtr, segment: BeamSegment, active: mi.Bool
     ) -> tuple[EdgePath, ObserverVertex]:
         """Record the path through null boundaries to the medium point; return the path and the observer there."""
         trace, layout, τ = self.trace, Layout.of(self.trace, True), segment.τ
         records = dr.alloc_local(record_type(layout), room_for(trace))
         sampler = CounterSampler.of(segment.key)
         path = PathState.begin(trace, CameraStart(ray, sampler, active))
-        path.at.medium = self.film.medium(trace, ray, active)
+        path.at.medium = medium
         at, flight = path.at, Flight.none(trace.media)
         travelled, k, count = mi.Float(0), mi.UInt32(0), mi.UInt32(0)
         room, go_on = room_for(trace), mi.Bool(path.active)
@@ -183,6 +189,12 @@ def _collision(trace: TraceConfig, at: Arrival, k: mi.UInt32, flight: Flight, ac
     return ObserverVertex(trace, SelectedVertex(at, k, k, flight.σ_s, mi.Float(1), mi.Bool(True), active, flight))
 
 
+def _scattered(y: ObserverVertex, shadow: HardShadow, sampler: CounterSampler, active: mi.Bool) -> mi.Spectrum:
+    """Return the light of the sampled emitter that only the lit side scatters at the medium point ``y``."""
+    Le = shadow.lit.Le * shadow.blocked(y.trace, y.at.medium, sampler, active)
+    return y.selected.β * y.towards(shadow.lit.ray.d, active)[0] * Le
+
+
 def _point_on(ray: mi.Ray3f, τ: mi.Float) -> mi.Interaction3f:
     """Return the interaction at distance ``τ`` along a ray."""
     x = dr.zeros(mi.Interaction3f)
@@ -209,8 +221,8 @@ class Distance:
         or, in media without bounds, have no end.
         """
         # `dr.freeze` would keep the bounding box that the scene had when the pass was recorded.
-        sphere = dr.gather(mi.Vector4f, trace.traits.tables.scene_bounds, mi.UInt32(0))
-        far = dr.norm(o - mi.Point3f(sphere.x, sphere.y, sphere.z)) + sphere.w
+        center, radius = trace.traits.tables.scene_sphere()
+        far = dr.norm(o - center) + radius
         reach, leaves = mi.Float(0), mi.Bool(False)
         for hit in hits:
             reach = dr.maximum(reach, dr.select(hit.is_valid(), hit.t, far))
@@ -269,8 +281,7 @@ class BeamArc(Arc):
         """Estimate the importance of a shadow boundary that crosses this arc."""
         active = self.active & self.distance.ok
         presence = detect(self.probe, self.length, active) * self.importance() * self.distance.relevance
-        light = dr.mean(dr.abs(self.observer.selected.β * self.f)) / (self.p * self.distance.pdf)
-        return dr.select(active, presence * light, 0)
+        return dr.select(active, presence * self.light / self.distance.pdf, 0)
 
     def resolve(self, weight: mi.Float, generator: mi.PCG32) -> ScatteredBeam:
         """Locate the shadow boundary by bisection, and compute its weight K: see `EdgeSearch.resolve`."""
@@ -284,12 +295,11 @@ class BeamArc(Arc):
         ray = x.origin.spawn_ray(dr.select(shadow.in_a, d_a, d_b))
         first, sampler = x.hit(ray, active), CounterSampler.stream(self.key, Stream.TRANSMITTANCE_OF_BEAM)
         T, medium = transmittance_up_to(trace, ray, τ, x.medium(ray.d), sampler, active)
-        y, entry, before = _observer_at(trace, ray, first, τ, medium, active & dr.any(T != 0))
+        y, entry, before = _observer_at(x, ray, first, τ, medium, active & dr.any(T != 0))
         active = y.active & y.at.medium.use_emitter_sampling()
-        T *= shadow.blocked(trace, y.at.medium, sampler, active)
         f, pdf = x.towards(ray.d, active)
-        f *= T * y.selected.β * y.towards(shadow.lit.ray.d, active)[0] * shadow.lit.Le
-        per_length = 0.5 * dr.pi * bracket.weight * self.weight(pdf, active) / self.distance.pdf
+        f *= T * _scattered(y, shadow, sampler, active)
+        per_length = self.per_length(bracket, pdf, active) / self.distance.pdf
         jump = dr.select(shadow.in_a, -1, 1) * x.selected.β * f * per_length
         slope = derivative_by_ray(ray, lambda ray: shadow.gap_at(_point_on(ray, τ), active)).d
         slope -= dr.dot(slope, ray.d) * ray.d
@@ -321,23 +331,24 @@ class ScatteredBeam:
 
 @dr.syntax
 def _observer_at(
-    trace: TraceConfig,
+    x: ObserverVertex,
     ray: mi.Ray3f,
     first: mi.PreliminaryIntersection3f,
     τ: mi.Float,
     medium: mi.MediumPtr,
     active: mi.Bool,
 ) -> tuple[ObserverVertex, mi.PreliminaryIntersection3f, mi.Float]:
-    """Return the observer at distance ``τ`` along a ray, which is in ``medium`` there.
+    """Return the observer at distance ``τ`` along a ray from ``x``, which is in ``medium`` there.
 
     Also returns the last null boundary before the observer, and the distance along the ray from which this boundary is
     the first hit. ``first`` is the first hit of the ray.
     """
+    trace = x.trace
     here, entry, onward = mi.PreliminaryIntersection3f(first), dr.zeros(mi.PreliminaryIntersection3f), mi.Ray3f(ray)
     entry.t = mi.Float(dr.inf)
     gone, before = mi.Float(0), mi.Float(0)
     passing = active & (here.t < τ) & is_boundary(trace, here, ray, active)
-    while dr.hint(passing, exclude=[trace, ray, τ], label="pathreplay: to a point of a medium"):
+    while dr.hint(passing, exclude=[x, trace, ray, τ], label="pathreplay: to a point of a medium"):
         entry, before = mi.PreliminaryIntersection3f(here), mi.Float(gone)
         gone += here.t
         gone += STEP * (1 + dr.max(dr.abs(ray.o)) + gone)
@@ -347,9 +358,7 @@ def _observer_at(
     active = active & (medium != None) & (gone < τ)  # noqa: E711 (an array of pointers)
     flight = Flight.none(trace.media)
     flight.event, flight.t = active, τ - gone
-    at = Arrival(onward, here, mi.Float(1), mi.Bool(False), mi.Bool(False), medium, mi.Float(0))
-    if trace.without_caustics:
-        at.scattered = mi.Bool(True)
+    at = replace(x.arrival(onward, here, mi.Float(1)), medium=medium)
     return _collision(trace, at, mi.UInt32(0), flight, active), entry, before
 
 
@@ -376,16 +385,12 @@ class ScatteredBeamSearch(EdgeSearch[CameraPath]):
     def resolve(self, segments: CameraPath, weight: mi.Float, generator: mi.PCG32) -> Edges:
         layout = Layout.of(self.trace, True)
         arc, records = self._arc(segments, layout, dr.alloc_local(record_type(layout), room_for(self.trace)))
-        crossing, x = arc.resolve(weight, generator), arc.observer.selected
-        path = EdgePath(segments.s, segments.key, dr.select(x.active, x.k, 0), x.at.ray, layout, records)
-        return Edges(path, [crossing], arc.observer)
+        path = segments.to_edge(arc.observer.selected, layout, records)
+        return Edges(path, [arc.resolve(weight, generator)], arc.observer)
 
     def _arc(self, path: CameraPath, layout: Layout | None, records: object) -> tuple[BeamArc, object]:
         """Draw an arc around a vertex of each path, and record the path unless ``records`` is None."""
-        ray, weight = dr.detach(self.film.ray(path.s, path.key))
         trace = replace(self.trace, max_depth=self.trace.max_depth - 1)  # the point of the medium is a vertex, too
-        shares, sampler = dr.ones(mi.Float, 1), CounterSampler.of(path.key)
-        records, x = choose_vertex(trace, sampler, ray, self.film.flows(path.s), shares, layout, records)
-        x.β *= weight / path.density
+        records, x = path.vertex(trace, self.film, dr.ones(mi.Float, 1), layout, records)
         arc = BeamArc.draw(ObserverVertex(self.trace, x), self.length, True, Stream.ARCS.of(path.key), x.active)
         return arc, records

@@ -143,8 +143,7 @@ class Emission:
         emitter = dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index, active)
         time = mi.Float(self.sensor.shutter_open()) + u.time * self.sensor.shutter_open_time()
         ray, weight = emitter.sample_ray(time, again, u.place, u.direction, active)
-        sphere = dr.gather(mi.Vector4f, trace.traits.tables.scene_bounds, mi.UInt32(0))
-        center, radius = mi.Point3f(sphere.x, sphere.y, sphere.z), sphere.w
+        center, radius = trace.traits.tables.scene_sphere()
         for each in self.suns:
             o, power = _from_sun(each, center, radius, u.place, again)
             here = emitter == mi.EmitterPtr(each)

@@ -79,13 +79,8 @@ class ViewPictures:
 
         A difference is `DIFFERENCE_GAIN` times (result - target); positive values are red, and negative values blue.
         """
-        return (
-            "target",
-            "start",
-            "result",
-            "difference",
-            *(() if self.baseline is None else ("baseline", "baseline-difference")),
-        )
+        kinds = "target", "start", "result", "difference"
+        return kinds if self.baseline is None else (*kinds, "baseline", "baseline-difference")
 
     def picture(self, kind: str) -> Image:
         if kind in ("difference", "baseline-difference"):

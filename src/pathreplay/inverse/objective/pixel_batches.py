@@ -36,9 +36,7 @@ class Batch:
         count = n if among is None else len(among)
         numbers = np.random.default_rng([BATCH, seed]).choice(count, min(most, count), replace=False)
         chosen = np.sort(numbers if among is None else among[numbers]).astype(np.uint32)
-        pixels = mi.UInt32(with_space(chosen)) + dr.opaque(
-            mi.UInt32, 0
-        )  # copy to memory that Dr.Jit owns, see `variables_of`
+        pixels = mi.UInt32(with_space(chosen)) + dr.opaque(mi.UInt32, 0)  # copied as by `owned`
         dr.eval(pixels)
         return Batch(pixels, count / n)
 

@@ -57,6 +57,11 @@ class Tables:
     emitter_bounds: mi.Float  # bounding sphere of each emitter: see `emitter_bounds`
     scene_bounds: mi.Float  # bounding sphere of the scene: centre and radius
 
+    def scene_sphere(self) -> tuple[mi.Point3f, mi.Float]:
+        """Return centre and radius of the bounding sphere of the scene."""
+        sphere = dr.gather(mi.Vector4f, self.scene_bounds, mi.UInt32(0))
+        return mi.Point3f(sphere.x, sphere.y, sphere.z), sphere.w
+
 
 @dataclass(frozen=True)
 class Traits:
