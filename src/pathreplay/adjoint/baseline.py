@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.platform.owned_arrays import owned
+from pathreplay.platform.owned_arrays import owned, with_space
 from pathreplay.transport.vertex import VertexRecord
 from pathreplay.transport.volume.media import interaction, majorant, span
 
@@ -186,7 +186,9 @@ class BaselineState:
                 f"the learned baseline of the media has the shapes {shapes} instead of {wanted}, "
                 "or a branching weight outside (0, 1]: start a new run"
             )
-        sums, branching = (owned(mi.Float(np.array(learned[name], np.float32))) for name in ("sums", "branching"))
+        sums, branching = (
+            owned(mi.Float(with_space(np.array(learned[name], np.float32)))) for name in ("sums", "branching")
+        )
         return BaselineState(BaselineCells.of(box), sums, branching)
 
 

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes.parameters import SceneValue
 from pathreplay.scenes.spectra import TO_COEFFICIENTS, WAVELENGTHS, coefficient_channels, spectrum
 
@@ -86,7 +87,7 @@ class Sky(Form):
 
     def see(self, stored: SceneValue) -> SceneValue:
         columns = np.array(dr.detach(stored))[:, 1:-1]
-        return mi.TensorXf(np.ascontiguousarray(columns[..., :1] if self.mono else columns))
+        return mi.TensorXf(with_space(np.ascontiguousarray(columns[..., :1] if self.mono else columns)))
 
     def store(self, seen: SceneValue) -> SceneValue:
         assert dr.is_tensor_v(seen)
@@ -142,7 +143,7 @@ class Spectra(Form):
         rows = colours.reshape(-1, 3).astype(np.float64)
         factor = np.maximum(2 * rows.max(axis=1), 1e-8) if self.scaled else np.ones(len(rows))
         fetched = [mi.srgb_model_fetch(mi.ScalarColor3f(*row)) for row in rows / factor[:, None]]
-        c = [mi.Float(np.array(column, np.float32)) for column in zip(*fetched, strict=True)]
+        c = [mi.Float(with_space(np.array(column, np.float32))) for column in zip(*fetched, strict=True)]
         seen = np.stack([np.array(spectrum(c, wavelength)) for wavelength in WAVELENGTHS], axis=-1)
         return (seen * factor[:, None]).reshape(colours.shape).astype(np.float32)
 

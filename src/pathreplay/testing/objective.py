@@ -17,6 +17,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.stateful import stateful
+from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.parameters import SceneValue, get_array
 from pathreplay.testing.direction import Line
@@ -68,7 +69,7 @@ class Objective:
 
     def weigh(self, weights: np.ndarray) -> None:
         """Set the weights w_k / n of the n values of the image. ``weights`` has the shape of the image."""
-        self.adjoint = mi.TensorXf(weights)
+        self.adjoint = mi.TensorXf(with_space(weights))
         self.weights = np.array(self.adjoint, np.float64)
 
     def weigh_by(self, loss: Loss | None, plain: mi.Integrator, seed: int, spp: int) -> None:

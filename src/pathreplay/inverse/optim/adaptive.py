@@ -15,6 +15,7 @@ import numpy as np
 
 from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.platform.owned_arrays import with_space
 
 _CLASSES = {"adam": drjit.opt.Adam, "adamw": drjit.opt.AdamW, "sgd": drjit.opt.SGD, "rmsprop": drjit.opt.RMSProp}
 # Names of state arrays. Adam and AdamW have the first moment, the second moment and, with AMSGrad, the maximum of the
@@ -148,8 +149,8 @@ class DrJitOptimiser(Optimiser):
                 part.state = {name: known[name] for name in names}
                 for name in names:
                     key, piece = pieces[name]
-                    part[name] = mi.TensorXf(values[key].reshape(-1)[piece])
-                    dr.set_grad(part[name], mi.TensorXf(gradients[key].reshape(-1)[piece]))
+                    part[name] = mi.TensorXf(with_space(values[key].reshape(-1)[piece]))
+                    dr.set_grad(part[name], mi.TensorXf(with_space(gradients[key].reshape(-1)[piece])))
                 part.step()
                 for name in names:
                     key, piece = pieces[name]

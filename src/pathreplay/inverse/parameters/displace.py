@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.parameter_options import Displace
 from pathreplay.platform import compat
+from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes.parameters import get_array
 
 
@@ -99,10 +100,10 @@ def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> 
         factors = _factors(params, key, owner, name, len(positions))
         maps.append(
             HeightMap(
-                mi.Point2f(u, v),
-                mi.Vector3f(*(direction * factors[:, None]).T.astype(np.float32)),
-                None if len(counts) == len(positions) else mi.UInt32(places.astype(np.uint32)),
-                mi.Float((1 / counts[places]).astype(np.float32)),
+                mi.Point2f(with_space(u), with_space(v)),
+                mi.Vector3f(*map(with_space, (direction * factors[:, None]).T.astype(np.float32))),
+                None if len(counts) == len(positions) else mi.UInt32(with_space(places.astype(np.uint32))),
+                mi.Float(with_space((1 / counts[places]).astype(np.float32))),
                 options.interpolation == "cubic",
             )
         )

@@ -11,6 +11,7 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.losses.pixelwise import Loss, mean_loss
+from pathreplay.platform.owned_arrays import with_space
 
 
 def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
@@ -40,9 +41,11 @@ def require_finite_loss(
         weight: weights of the pixels, or None.
         picture: rendered image; None stands for a black image.
     """
-    image = mi.TensorXf(np.zeros_like(target) if picture is None else picture)
+    image = mi.TensorXf(with_space(np.zeros_like(target) if picture is None else picture))
     dr.enable_grad(image)
-    value = mean_loss(loss, image, mi.TensorXf(target), None if weight is None else mi.TensorXf(weight))
+    value = mean_loss(
+        loss, image, mi.TensorXf(with_space(target)), None if weight is None else mi.TensorXf(with_space(weight))
+    )
     if not dr.grad_enabled(value):
         raise PathreplayError(
             f"{loss} does not depend on the image; compute it with Dr.Jit functions and arrays throughout"
