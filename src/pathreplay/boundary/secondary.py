@@ -55,7 +55,7 @@ class CameraPath:
     number: mi.UInt32  # the segment that the lane bisects: 0 for the segment in the square, i for the i-th arc
 
     def vertex(
-        self, trace: TraceConfig, film: FilmDomain, shares: mi.Float, layout: Layout | None, records: Any
+        self, trace: TraceConfig, film: FilmDomain, shares: mi.Float, layout: Layout | None, records: object
     ) -> tuple[Any, SelectedVertex]:
         """Select a vertex of each path (see `choose_vertex`), and record the path unless ``records`` is None."""
         ray, weight = dr.detach(film.ray(self.s, self.key))
@@ -64,7 +64,7 @@ class CameraPath:
         x.β *= weight / self.density
         return records, x
 
-    def to_edge(self, x: SelectedVertex, layout: Layout, records: Any) -> EdgePath:
+    def to_edge(self, x: SelectedVertex, layout: Layout, records: object) -> EdgePath:
         """Return the recorded path to the vertex ``x``."""
         return EdgePath(self.s, self.key, dr.select(x.active, x.k, 0), x.at.ray, layout, records)
 
