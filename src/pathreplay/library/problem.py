@@ -161,7 +161,7 @@ class Problem:
 
         Raises:
             PathreplayError: shared parameters have different shapes, two problems have the same scene, or a problem has
-                exposures or a baseline.
+                exposures, a response or a baseline.
         """
         if isinstance(problems, Problem) or not problems:
             found = "this is a single one" if problems else "there are none"
