@@ -20,8 +20,8 @@ from pathreplay.types import Json
 class Parameter:
     """Options of one scene parameter, or of all parameters that match a glob.
 
-    The fields have the same names as the keys in a job. Values are decoded reflectances and radiances, in the shape
-    that `mi.traverse` shows.
+    The fields have the same names as the keys in a job, except ``bounds``, which is ``lower`` and ``upper`` in a job.
+    Values are decoded reflectances and radiances, in the shape that `mi.traverse` shows.
 
     Args:
         initial: initial value: a number, a colour, an array in the parameter's shape, or an image or volume file. For a
