@@ -5,8 +5,8 @@ GPU reserves local memory for every thread that can be resident, whatever the la
 records of 124 bytes per thread, for 2048 threads on each of 132 multiprocessors, take 69 GB. Long paths are therefore
 recorded only on CPUs.
 
-The limits for GPUs were measured on an H100 (docs/memory.md). Tests check the limits with simulated devices. On other
-GPUs, `pathreplay doctor --gpu` measures the limits.
+Runs on an H100 determined `LARGEST_LOCAL` and `FEWEST_RECORDS`. The resulting depths are computed, with simulated
+devices in tests (docs/memory.md). On other GPUs, `pathreplay doctor --gpu` runs passes close to these depths.
 """
 
 from __future__ import annotations
