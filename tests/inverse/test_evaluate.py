@@ -75,6 +75,23 @@ def test_what_was_never_learned_is_forgotten(kind: str) -> None:
     assert bits(again) == bits(first)
 
 
+def test_large_variables_with_equal_gradients_add_up(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    """The gradients of two summands are one array of Dr.Jit, which is not overwritten for both."""
+    monkeypatch.setattr("pathreplay.inverse.objective.evaluate.LARGE", 8)
+    (room / "own.py").write_text("def total(first, a, b): return first + a + b")
+    parameters = [{"key": key, "shape": [2, 2, 3], "initial": 0.1} for key in ("a", "b")]
+    problem = problem_of(
+        **SWEEP, parameters=parameters, derived=[{"key": TEXTURE, "function": "own:total", "of": ["a", "b"]}]
+    )
+    values = new_run(problem, problem.integrator).values
+    shards = [Shard((view,), 4, (view,)) for view in (0, 1)]
+    evaluate = Evaluator(problem, problem.integrator, record=False)
+    apart = [{key: value.copy() for key, value in evaluate(values, s, {}).gradients.items()} for s in shards]
+    found = total((evaluate(values, s, {}) for s in shards), 0.5, owned=True).gradients
+    for key, gradient in found.items():
+        np.testing.assert_allclose(gradient, 0.5 * (apart[0][key] + apart[1][key]), rtol=1e-3)
+
+
 @pytest.mark.parametrize("kind", ["prb", "l1"])
 def test_the_graph_holds_one_view(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Variables under differentiation where a loss goes back: as many for four views as for one."""

@@ -292,9 +292,12 @@ class Evaluator:
         except NotRecordable:  # a part of the gradient may have been added: start again with a zero gradient
             self._sensors = None
             return self._view(values, view, seed, spp, pixels)
-        gradients = {}
+        gradients: dict[str, Array] = {}
         for key, value in moving.items():
-            gradients[key] = _taken(dr.grad(value))  # The gradient is zero if the variable does not affect the view.
+            gradient = _taken(dr.grad(value))  # The gradient is zero if the variable does not affect the view.
+            # Equal gradients may be one array of Dr.Jit, but `Total` overwrites each gradient on its own.
+            shared = any(np.may_share_memory(gradient, other) for other in gradients.values())
+            gradients[key] = gradient.copy() if shared else gradient
             dr.clear_grad(value)  # The scene refers to the variable, which would keep the gradient in memory.
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
