@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
 import pytest
 
+from end_of_page import run_at_the_end
 from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Executor, Local, Shard, total
 from pathreplay.inverse.optim.adaptive import DrJitOptimiser, Optimiser, State
@@ -111,6 +113,30 @@ def test_a_state_of_another_optimiser_is_refused() -> None:
     go_on(optimiser, start(), 1)
     with pytest.raises(ValueError, match="is not a state array of this optimizer"):
         DrJitOptimiser(start(), Optimizer(type="sgd")).restore(optimiser.state(), start())
+
+
+AT_THE_END = """
+from types import SimpleNamespace
+from pathreplay.inverse.config.optimizer_options import Optimizer
+from pathreplay.inverse.optim.adaptive import DrJitOptimiser, State
+from pathreplay.library.optimizers import OfMitsuba
+
+x = {"x": at_the_end(np.ones(15, np.float32))}
+rates = {"x": 0.5}
+problem = SimpleNamespace(variables=[], config=SimpleNamespace(exposure=None, response=None, parameters=[]))
+problem.variables = [SimpleNamespace(key="x", learning_rate=0.5)]
+for make in (lambda: DrJitOptimiser(x), lambda: OfMitsuba(mi.ad.Adam(lr=0.5), x, problem)):
+    optimiser, other = make(), make()
+    optimiser.step(x, x, rates)
+    state = optimiser.state()
+    other.restore(State(state.steps, {name: at_the_end(array) for name, array in state.arrays.items()}), x)
+    print((other.step(x, x, rates)["x"] == optimiser.step(x, x, rates)["x"]).all())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="protects a page of memory")
+def test_states_and_values_are_taken_from_the_end_of_memory() -> None:
+    assert run_at_the_end(AT_THE_END) == ["True", "True"]
 
 
 def test_averaging_may_begin_and_end_within_a_run() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from typing import Any
 
@@ -11,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from end_of_page import run_at_the_end
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import (
     displaced,
@@ -24,21 +24,11 @@ from pathreplay.scenes.parameters import (
 
 # Arrays of NumPy that end where memory ends: the next page cannot be read.
 AT_THE_END = """
-import ctypes, mmap
-import pathreplay
 import drjit as dr
-import mitsuba as mi
-import numpy as np
 from pathreplay.scenes.parameters import to_value
 
-mi.set_variant("llvm_ad_rgb")
-page = mmap.PAGESIZE
-memory = mmap.mmap(-1, 2 * page)
-begin = ctypes.addressof(ctypes.c_char.from_buffer(memory))
-assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(begin + page), page, 0) == 0
 for n in (15, 16, 1000):
-    values = np.frombuffer(memory, np.float32, n, page - 4 * n)
-    values[:] = 1
+    values = at_the_end(np.ones(n, np.float32))
     for like in (dr.zeros(mi.Float, n), dr.zeros(mi.TensorXf, (n, 1))):
         taken = to_value(like, values.reshape(np.shape(like))) * 2
         print(n, dr.sum(taken, axis=None))
@@ -213,6 +203,5 @@ def test_an_infinite_vertex_and_colour_are_found_too(params: Any) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="protects a page of memory")
 def test_values_are_taken_from_the_end_of_memory() -> None:
-    done = subprocess.run([sys.executable, "-c", AT_THE_END], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert [float(line.split()[1].strip("[]")) for line in done.stdout.splitlines()] == [30, 30, 32, 32, 2000, 2000]
+    lines = run_at_the_end(AT_THE_END)
+    assert [float(line.split()[1].strip("[]")) for line in lines] == [30, 30, 32, 32, 2000, 2000]

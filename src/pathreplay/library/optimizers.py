@@ -19,6 +19,7 @@ from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import latents
 from pathreplay.inverse.problem.problem import Problem
+from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes.parameters import resolve_keys
 from pathreplay.types import Json
 
@@ -49,7 +50,7 @@ class OfMitsuba(Optimiser):
         self._optimizer, self._steps = optimizer, dict.fromkeys(values, 0)
         self.use(problem)
         for key, value in values.items():
-            optimizer[key] = mi.TensorXf(value)
+            optimizer[key] = mi.TensorXf(with_space(value))
 
     def use(self, problem: Problem) -> None:
         """Take the learning rates of this problem, before schedule and stages, for the next steps."""
@@ -64,8 +65,8 @@ class OfMitsuba(Optimiser):
         for key, value in values.items():
             anew = optimizer[key].shape != value.shape
             self._steps[key] = 1 if anew else self._steps[key] + 1
-            optimizer[key] = mi.TensorXf(value)
-            dr.set_grad(optimizer[key], mi.TensorXf(gradients[key]))
+            optimizer[key] = mi.TensorXf(with_space(value))
+            dr.set_grad(optimizer[key], mi.TensorXf(with_space(gradients[key])))
         optimizer.state = {key: known[key] for key in values}  # other variables keep their state
         before = {key: optimizer.learning_rate(key) for key in values}
         optimizer.set_learning_rate({key: self._rate(key, rates[key]) for key in values})
@@ -96,13 +97,15 @@ class OfMitsuba(Optimiser):
     def restore(self, state: State, values: Arrays) -> None:
         arrays = dict(state.arrays)
         for key, value in values.items():
-            self._optimizer[key] = mi.TensorXf(value)
+            self._optimizer[key] = mi.TensorXf(with_space(value))
             about = self._optimizer.state[key]
             like = _leaves(about[3:])
             found = [arrays.pop(f"{n}:{key}") for n in range(len(like))]
             if any(np.array(leaf).shape != array.shape for leaf, array in zip(like, found, strict=True)):
                 raise ValueError(f"the state of '{key}' has the wrong shape")
-            kept = _with_leaves(about[3:], iter([type(leaf)(a) for leaf, a in zip(like, found, strict=True)]))
+            kept = _with_leaves(
+                about[3:], iter([type(leaf)(with_space(a)) for leaf, a in zip(like, found, strict=True)])
+            )
             self._optimizer.state[key] = (*about[:3], *kept)
         if arrays:
             raise ValueError(f"'{min(arrays)}' is not a state array of this optimizer")

@@ -23,6 +23,7 @@ from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Half, model_
 from pathreplay.inverse.parameters.values import Array, Arrays, split
 from pathreplay.inverse.problem.problem import Problem, scene_values
 from pathreplay.platform import memory
+from pathreplay.platform.owned_arrays import with_space
 
 IMAGE = ""
 """Key by which `Jacobians` requests the image. The key of a variable requests a derivative with respect to it."""
@@ -92,8 +93,9 @@ class Jacobians:
                 dropped[key] = lost
             begin += size
         share = about.share / len(self.problem.trained())
-        weight = None if about.weight is None else mi.TensorXf(about.weight)
-        slope = np.array(linear_derivative(self.problem.loss, mi.TensorXf(about.target), weight)[1]) * share
+        weight = None if about.weight is None else mi.TensorXf(with_space(about.weight))
+        target = mi.TensorXf(with_space(about.target))
+        slope = np.array(linear_derivative(self.problem.loss, target, weight)[1]) * share
         loss, gradient, model = model_of(a, b, np.broadcast_to(slope, about.target.shape), sizes)
         return loss, split(gradient, {key: values[key].shape for key in self._moving}), dropped, model
 

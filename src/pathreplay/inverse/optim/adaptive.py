@@ -196,7 +196,8 @@ class DrJitOptimiser(Optimiser):
                     raise ValueError(f"'{what}:{key}', a second moment, is negative")
             for name, piece in self._pieces(key).items():
                 like = self._remembered(name, part)
-                restored = {what: type(like[what])(array.reshape(-1)[piece]) for what, array in saved.items()}
+                flat = {what: with_space(array.reshape(-1)[piece]) for what, array in saved.items()}
+                restored = {what: type(like[what])(array) for what, array in flat.items()}
                 stored, promoted, rate, kept = part.state[name]
                 arrays = tuple(restored.get(what) for what in self._names)
                 kept = (type(kept[0])(state.steps[key]), *arrays) if self._moments else arrays[0]
