@@ -29,6 +29,15 @@ def test_resampling_is_mitsuba_s_lookup_at_the_new_centres(shape: tuple[int, ...
     assert grids.resampled(GRID, shape) == pytest.approx(expected, abs=1e-5)
 
 
+def test_environment_maps_are_resampled_across_the_seam() -> None:
+    """A map that begins at another column is resampled to the same map."""
+    sky = np.array([[[0], [1], [2], [9]]], np.float32)
+    found = grids.resampled(sky, (2, 8, 1), wraps=True)
+    np.testing.assert_allclose(found[0, :, 0], [2.25, 0.25, 0.75, 1.25, 1.75, 3.75, 7.25, 6.75], rtol=1e-6)
+    turned = grids.resampled(np.roll(sky, 1, axis=1), (2, 8, 1), wraps=True)
+    np.testing.assert_allclose(turned, np.roll(found, 2, axis=1), rtol=1e-6)
+
+
 def test_levels_keep_proportions_and_begin_in_their_iteration() -> None:
     levels = grids.make_levels((16, 32, 8, 1), [4, 16], [10])
     assert [levels.shape_at(t) for t in (0, 9.5, 10, 50)] == [(2, 4, 2, 1), (2, 4, 2, 1), (8, 16, 4, 1), (8, 16, 4, 1)]

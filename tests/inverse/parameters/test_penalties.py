@@ -39,6 +39,14 @@ def test_total_variation_and_prior(shape: tuple[int, ...]) -> None:
     require_slope(penalty, v)
 
 
+def test_total_variation_of_an_environment_map_is_the_same_from_any_column() -> None:
+    v = uniform(4, 5, 3)
+    wraps = TotalVariation(0.3, wraps=True)
+    penalties = [wraps(np.roll(v, k, axis=1))[0] for k in range(5)]
+    assert penalties == pytest.approx([penalties[0]] * 5) and penalties[0] != TotalVariation(0.3)(v)[0]
+    require_slope(Penalty((wraps,)), v)
+
+
 def test_a_grid_that_is_refined_is_pulled_to_its_start() -> None:
     start = np.full((2, 2, 2, 1), 0.25, np.float32)
     assert Prior(1.0, start)(np.full((4, 4, 4, 1), 0.75, np.float32))[0] == pytest.approx(0.25)

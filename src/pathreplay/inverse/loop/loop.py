@@ -285,10 +285,10 @@ def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
 def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array], list[Event]]:
     """Resample grids that are due for refinement and not frozen. Returns all values, and an event per such grid."""
     moving = [v for v in part.problem.variables if v.key in part.moving]
-    due = {v.key: v.levels.shape_at(position) for v in moving if v.levels}
-    due = {key: shape for key, shape in due.items() if values[key].shape != shape}
-    grids = {key: resampled(values[key], shape) for key, shape in due.items()}
-    return {**values, **grids}, [Refined(key, shape) for key, shape in due.items()]
+    due = [(v, v.levels.shape_at(position)) for v in moving if v.levels]
+    due = [(v, shape) for v, shape in due if values[v.key].shape != shape]
+    grids = {v.key: resampled(values[v.key], shape, v.form.wraps) for v, shape in due}
+    return {**values, **grids}, [Refined(v.key, shape) for v, shape in due]
 
 
 def _shards(part: Part, iteration: int, spp: int, optimiser: Optimiser) -> list[Shard]:

@@ -135,7 +135,8 @@ def _at_level(variable: Variable, k: int) -> Array:
     """Resample the initial value of a variable to its k-th resolution, or to the last one if there are fewer."""
     if variable.levels is None:
         return variable.start
-    return resampled(variable.start, variable.levels.shapes[min(k, len(variable.levels.shapes) - 1)])
+    shape = variable.levels.shapes[min(k, len(variable.levels.shapes) - 1)]
+    return resampled(variable.start, shape, variable.form.wraps)
 
 
 def _require(derived: Derived, variables: dict[str, SceneValue]) -> None:

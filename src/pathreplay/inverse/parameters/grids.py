@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.ndimage
@@ -46,15 +47,20 @@ def make_levels(shape: Sequence[int], longest: Sequence[int], refine_at: Sequenc
     return Levels(tuple(shapes), (0, *refine_at))
 
 
-def resampled(grid: Array, shape: Sequence[int]) -> Array:
+def resampled(grid: Array, shape: Sequence[int], wraps: bool = False) -> Array:
     """Resample a grid to ``shape`` by linear interpolation between cell centres, clamped at the border.
 
-    The number of channels stays the same. Textures and volumes of Mitsuba interpolate in the same way, so doubling the
-    resolution hardly changes the texture. The result stays within the range of the values. Downsampling by more than a
-    factor of two skips entries.
+    If ``wraps``, the x axis (the one before the channels) is periodic, as in environment maps. The number of channels
+    stays the same. Textures and volumes of Mitsuba interpolate in the same way, so doubling the resolution hardly
+    changes the texture. The result stays within the range of the values. Downsampling by more than a factor of two
+    skips entries.
     """
     factors = [new / old for new, old in zip((*shape[:-1], grid.shape[-1]), grid.shape, strict=True)]
-    return scipy.ndimage.zoom(grid, factors, np.float32, order=1, mode="nearest", grid_mode=True)
+    zoom = partial(scipy.ndimage.zoom, output=np.float32, order=1, grid_mode=True)
+    if wraps:
+        along_x = [factor if axis == grid.ndim - 2 else 1.0 for axis, factor in enumerate(factors)]
+        grid, factors[-2] = zoom(grid, along_x, mode="grid-wrap"), 1.0
+    return zoom(grid, factors, mode="nearest")
 
 
 def comparable(shape: Sequence[int], other: Sequence[int]) -> bool:

@@ -57,17 +57,22 @@ class TotalVariation:
     """
 
     weight: float
+    wraps: bool = False
+    """Whether the first and the last column are neighbours, as in environment maps."""
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
         v = values.astype(np.float64)
         penalty, gradient = 0.0, np.zeros_like(v)
         for axis in range(v.ndim - 1):
-            Δ = np.diff(v, axis=axis)
+            periodic = self.wraps and axis == v.ndim - 2
+            Δ = np.roll(v, -1, axis) - v if periodic else np.diff(v, axis=axis)
             if Δ.size:
                 length = np.sqrt(Δ * Δ + ROUND**2)
                 penalty += self.weight * float(np.mean(length - ROUND))
                 slope = self.weight * Δ / length / Δ.size
-                gradient -= np.diff(slope, axis=axis, prepend=0, append=0)
+                gradient -= (
+                    slope - np.roll(slope, 1, axis) if periodic else np.diff(slope, axis=axis, prepend=0, append=0)
+                )
         return penalty, gradient
 
 
@@ -77,9 +82,11 @@ class Prior:
 
     weight: float
     start: Array
+    wraps: bool = False
+    """See `resampled`."""
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
-        start = self.start if self.start.shape == values.shape else resampled(self.start, values.shape)
+        start = self.start if self.start.shape == values.shape else resampled(self.start, values.shape, self.wraps)
         off = values.astype(np.float64) - start
         return self.weight * float(np.mean(off * off)), self.weight * 2 * off / off.size
 

@@ -193,9 +193,9 @@ def make_variables(
             else:
                 assert coordinates is not None
                 bounded(key, rate, coordinates.latent(start))
-            penalty = _penalty(params, key, entry, start, levels, modules)
+            penalty = _penalty(params, key, entry, start, levels, modules, form.wraps)
             if levels is not None:
-                start = resampled(start, levels.shapes[0])
+                start = resampled(start, levels.shapes[0], form.wraps)
             if dr.is_tensor_v(like):
                 like = dr.zeros(type(like), start.shape)  # literal zeros, which take no memory
             variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
@@ -249,22 +249,28 @@ def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.inte
 
 
 def _penalty(
-    params: mi.SceneParameters, key: str, entry: Parameter, start: Array, levels: Levels | None, modules: Modules
+    params: mi.SceneParameters,
+    key: str,
+    entry: Parameter,
+    start: Array,
+    levels: Levels | None,
+    modules: Modules,
+    wraps: bool,
 ) -> Penalty | None:
     """Make the regularizers of a parameter. Raises PathreplayError if a regularizer fails in some resolution."""
     terms: list[Term] = []
     if entry.total_variation is not None:
         _require_grid(key, start, "total_variation")
-        terms.append(TotalVariation(entry.total_variation))
+        terms.append(TotalVariation(entry.total_variation, wraps))
     if entry.l2_to_initial is not None:
-        terms.append(Prior(entry.l2_to_initial, start))
+        terms.append(Prior(entry.l2_to_initial, start, wraps))
     if entry.laplacian_weight is not None:
         faces = _faces(params, key, "laplacian_weight")
         terms.append(Laplacian(entry.laplacian_weight, parameters.get_array(params[key]), faces))
     if entry.regularizer is not None:
         terms.append(Own(modules.function("Regularizer", entry.regularizer, "values")))
         for shape in levels.shapes if levels else [start.shape]:
-            terms[-1](resampled(start, shape))
+            terms[-1](resampled(start, shape, wraps))
     return Penalty(tuple(terms)) if terms else None
 
 
