@@ -16,8 +16,8 @@ from pathreplay.inverse.parameters.values import Array
 from pathreplay.platform import memory
 
 # Bytes per optimised number, for eight floats: the old value, the new value, the copy in Dr.Jit, the gradient, the sum
-# of gradients, Adam's two moments and a temporary. The means of iterate averaging are not counted, because large
-# variables are not averaged.
+# of gradients, Adam's two moments and a temporary. The two means of iterate averaging are not counted: variables of
+# more than 2^24 entries are not averaged, so the means of a variable take at most 128 MB.
 _A_VALUE = 32
 # Largest ratio of a learning rate to the values. The learning rate is about the length of Adam's steps.
 _LONGEST_STEP = 1e6
