@@ -99,6 +99,27 @@ def test_parameters_of_which_one_undoes_the_other_are_named() -> None:
     assert trade_offs({**free, "d": b + 0.3 * random.normal(size=b.shape)}) == ()
 
 
+def test_values_stay_in_the_range_of_their_parameterization(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A parameter with logarithmic steps has no bounds, and is differentiated at positive values only."""
+    monkeypatch.chdir(tmp_path)
+    Path("scene.xml").write_text(SCENE)
+    job = {
+        "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 1}, "spp": 1, "learning_rate": 0.1,
+        "parameters": [{"key": PAINT, "initial": 0.5, "parameterization": "log"}],
+    }  # fmt: skip
+    problem = build_problem(make_config(job), tmp_path)
+    seen: list[np.ndarray] = []
+
+    def rendered(problem: object, values: dict[str, np.ndarray], spp: int) -> np.ndarray:
+        seen.append(values[PAINT])
+        return values[PAINT]
+
+    monkeypatch.setattr("pathreplay.inverse.loop.trade_offs._rendered", rendered)
+    columns, unseen = columns_of(problem, {PAINT: np.full(3, 1e-4, np.float32)})
+    assert not unseen and columns[PAINT].shape == (3, 3)
+    assert len(seen) == 6 and min(value.min() for value in seen) > 0
+
+
 # ------------------------------ In a run ------------------------------
 
 SCENE = """<scene version="3.0.0">

@@ -24,7 +24,7 @@ from pathreplay.inverse.objective.evaluate import LARGE
 from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.values import Array, Arrays
-from pathreplay.inverse.parameters.variables import Variable
+from pathreplay.inverse.parameters.variables import Variable, range_of
 from pathreplay.inverse.problem.problem import Problem
 
 FEW = 4
@@ -79,12 +79,12 @@ def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Colu
     spp = min(problem.config.most_spp, MOST_SAMPLES, int(max(FREE_SAMPLES, SHARE * taken) / pictures))
     if spp < 1 or pixels > MOST_PIXELS:
         return {}, ()
-    bounds = {v.key: v.bounds for v in variables}
+    ranges = {v.key: range_of(v) for v in variables}
     jacobian, unseen = {}, []
     for key, perturbations in changes.items():
         columns = []
         for change in perturbations:
-            ahead, behind = (np.clip(values[key] + sign * change, *bounds[key]) for sign in (1, -1))
+            ahead, behind = (_moved(values[key], sign * change, ranges[key]) for sign in (1, -1))
             column = _rendered(problem, {**values, key: ahead}, spp) - _rendered(problem, {**values, key: behind}, spp)
             column = np.where(np.isfinite(column), column, 0)
             if column.any():
@@ -106,6 +106,15 @@ def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
         picture = picture_of(problem, values, view, spp)
         pictures.append((picture if view.weight is None else picture * np.sqrt(view.weight)).ravel())
     return np.concatenate(pictures)
+
+
+def _moved(value: Array, change: Array, within: tuple[float, float]) -> Array:
+    """Add a change to a value. Entries move at most half of their distance from the ends of the range ``within``.
+
+    The scene may be undefined at the ends and beyond.
+    """
+    least, most = (0.5 * (np.float32(end) - value) for end in within)
+    return value + np.clip(change, least, most)
 
 
 def _changes(variable: Variable, value: Array, few: int = FEW) -> list[Array]:
