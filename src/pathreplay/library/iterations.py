@@ -16,7 +16,7 @@ from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.events import Event, Stepped
-from pathreplay.inverse.loop.loop import best_values, computed, new_run, picture_of
+from pathreplay.inverse.loop.loop import best_values, computed, new_run, pictures_of
 from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem
@@ -88,7 +88,8 @@ def rendered(problem: Problem, values: Arrays, view: int | str, spp: int | None)
         place = ids.index(view)
     if place is not None:
         with problem.computing():
-            return picture_of(problem, values, problem.views[place], spp)
+            ((_, image),) = pictures_of(problem, values, [problem.views[place]], spp)
+            return image
     raise PathreplayError(f"No view {shown(view)}; there are {', '.join(each.name for each in problem.views)}")
 
 

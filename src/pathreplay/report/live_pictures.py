@@ -15,7 +15,7 @@ from pathreplay.inverse.images.io import Image, displayed, exposure_for
 from pathreplay.inverse.images.metrics import Likeness
 from pathreplay.inverse.loop.checkpoint import Run
 from pathreplay.inverse.loop.events import Event, Stepped
-from pathreplay.inverse.loop.loop import best_values, picture_of
+from pathreplay.inverse.loop.loop import best_values, pictures_of
 from pathreplay.inverse.parameters import grids
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.interrupts import Stop
@@ -102,7 +102,7 @@ class LivePictures:
         config = self._problem.config
         spp = max(config.most_spp, min(LEAST_SPP, config.eval_spp))
         values = best_values(self._problem, self._run)
-        return {view.name: picture_of(self._problem, values, view, spp) for view in self.views}
+        return dict(pictures_of(self._problem, values, self.views, spp))
 
     def small(self) -> tuple[pages.View, ...]:
         """Return target, current image and difference of each view as thumbnails (data URIs)."""

@@ -361,14 +361,21 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
 
 def render_views(problem: Problem, values: Arrays) -> dict[str, Image]:
     """Render all views with the job's integrator at these values. All calls use the same random numbers."""
-    return {view.name: problem.disk.keep(picture_of(problem, values, view)) for view in problem.views}
+    return {name: problem.disk.keep(image) for name, image in pictures_of(problem, values, problem.views)}
 
 
-def picture_of(problem: Problem, values: Arrays, view: View, spp: int | None = None) -> Image:
-    """Render one view as `render_views` does, with ``spp`` samples per pixel (default: ``eval_spp``)."""
-    put_values(problem.home(view)[0], values)
-    index = next(n for n, other in enumerate(problem.views) if other.name == view.name)
-    return exposed(values, index, _plain(problem, view, problem.config.eval_spp if spp is None else spp))
+def pictures_of(
+    problem: Problem, values: Arrays, views: Iterable[View], spp: int | None = None
+) -> Iterator[tuple[str, Image]]:
+    """Render some views as `render_views` does, with ``spp`` samples per pixel (default: ``eval_spp``).
+
+    Yields name and image of each view. The values are set once, before the first view.
+    """
+    put_values(problem, values)
+    places = {view.name: n for n, view in enumerate(problem.views)}
+    for view in views:
+        image = _plain(problem, view, problem.config.eval_spp if spp is None else spp)
+        yield view.name, exposed(values, places[view.name], image)
 
 
 def _plain(problem: Problem, view: View, spp: int) -> Image:

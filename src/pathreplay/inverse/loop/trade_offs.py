@@ -19,7 +19,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathreplay.inverse.loop.loop import picture_of
+from pathreplay.inverse.loop.loop import pictures_of
 from pathreplay.inverse.objective.evaluate import LARGE
 from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.response import RESPONSE
@@ -102,8 +102,8 @@ def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
     Returns the pixels of all views in one vector. Each pixel is multiplied by the square root of its weight.
     """
     pictures = []
-    for view in problem.trained().values():
-        picture = picture_of(problem, values, view, spp)
+    views = problem.trained().values()
+    for view, (_, picture) in zip(views, pictures_of(problem, values, views, spp), strict=True):
         pictures.append((picture if view.weight is None else picture * np.sqrt(view.weight)).ravel())
     return np.concatenate(pictures)
 
