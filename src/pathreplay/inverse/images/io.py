@@ -166,6 +166,11 @@ def oddities(path: Path) -> list[str]:
     return notes
 
 
+def colours_of(channels: int) -> int:
+    """Return how many of the channels of an image are colours. With two or four channels, the last one is alpha."""
+    return channels - (channels in (2, 4))
+
+
 def with_channels(image: Image, channels: int) -> Image | None:
     """Convert an image to another number of channels.
 

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.images.io import Image
+from pathreplay.inverse.images.io import Image, colours_of
 from pathreplay.inverse.losses.pixelwise import Loss, mean_loss
 from pathreplay.inverse.parameters.reparameterization import Transform
 from pathreplay.inverse.parameters.response import linearized, stored
@@ -52,7 +52,7 @@ class Factors(Transform):
 
 def start(views: int, channels: int, white_balance: bool) -> Array:
     """Return initial factors of 1. Raises PathreplayError for white balance of images with one colour channel."""
-    colours = channels - (channels in (2, 4))
+    colours = colours_of(channels)
     if white_balance and colours == 1:
         raise PathreplayError("exposure: 'white_balance' needs colour images, but these have one channel; remove it")
     return np.ones((views, colours if white_balance else 1), np.float32)
@@ -67,7 +67,7 @@ def factor_of(values: Arrays, view: int, channels: int) -> Image | None:
         return None
     row = values[EXPOSURE][view]
     factor = np.ones((1, 1, channels), np.float32)
-    factor[:, :, : channels - (channels in (2, 4))] = row
+    factor[:, :, : colours_of(channels)] = row
     return factor
 
 
@@ -103,7 +103,7 @@ def gradient(values: Arrays, view: int, by_log: Array) -> Array:
     """Convert the result of `derivative` for one view to a gradient with respect to the factors of all views."""
     rows = values[EXPOSURE]
     by_factors = np.zeros_like(rows)
-    colours = by_log[: len(by_log) - (len(by_log) in (2, 4))]
+    colours = by_log[: colours_of(len(by_log))]
     by_factors[view] = (colours if rows.shape[1] > 1 else colours.sum()) / rows[view]
     return by_factors
 
@@ -112,7 +112,7 @@ def derivatives_by_factors(values: Arrays, view: int, picture: Image) -> Array:
     """Return the derivatives of a view's image, times its factor, with respect to each factor of all views."""
     rows = values[EXPOSURE]
     found = np.zeros((*rows.shape, *picture.shape), np.float32)
-    colours = picture.shape[2] - (picture.shape[2] in (2, 4))
+    colours = colours_of(picture.shape[2])
     for channel in range(colours):
         found[view, channel if rows.shape[1] > 1 else 0, :, :, channel] = picture[:, :, channel]
     return found.reshape(-1, *picture.shape)
@@ -120,7 +120,7 @@ def derivatives_by_factors(values: Arrays, view: int, picture: Image) -> Array:
 
 def fitted(picture: Image, target: Image, weight: Image | None, each: bool) -> Array:
     """Fit factors on an image to its target by least squares: one per colour if ``each``, or one for all colours."""
-    colours = picture.shape[2] - (picture.shape[2] in (2, 4))
+    colours = colours_of(picture.shape[2])
     w = np.ones((1, 1, 1)) if weight is None else weight.astype(np.float64)
     a, t = (image[:, :, :colours].astype(np.float64) for image in (picture, target))
     axes = (0, 1) if each else (0, 1, 2)

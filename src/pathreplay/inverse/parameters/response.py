@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pathreplay.inverse.images.io import Image, encoded
+from pathreplay.inverse.images.io import Image, colours_of, encoded
 from pathreplay.inverse.parameters.reparameterization import Coordinates
 from pathreplay.inverse.parameters.values import Array, Arrays
 
@@ -144,5 +144,5 @@ def _decoding_slope(y: np.ndarray) -> np.ndarray:
 
 def _split(image: Image) -> tuple[Image, Image]:
     """Split an image into its colours and its alpha channel, which may be absent."""
-    colours = image.shape[2] - (image.shape[2] in (2, 4))
+    colours = colours_of(image.shape[2])
     return image[:, :, :colours], image[:, :, colours:]
