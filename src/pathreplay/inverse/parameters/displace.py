@@ -95,18 +95,14 @@ def displacement_of(params: mi.SceneParameters, key: str, options: Displace) -> 
             )
         direction = np.broadcast_to(vector / length, positions.shape)
     u, v = _coordinates(params, key, options.coordinates, positions)
+    coordinates = mi.Point2f(with_space(u), with_space(v))
+    merged = None if len(counts) == len(positions) else mi.UInt32(with_space(places.astype(np.uint32)))
+    share = mi.Float(with_space((1 / counts[places]).astype(np.float32)))
     maps = []
     for name in options.weights if isinstance(options.weights, list) else [options.weights]:
         factors = _factors(params, key, owner, name, len(positions))
-        maps.append(
-            HeightMap(
-                mi.Point2f(with_space(u), with_space(v)),
-                mi.Vector3f(*map(with_space, (direction * factors[:, None]).T.astype(np.float32))),
-                None if len(counts) == len(positions) else mi.UInt32(with_space(places.astype(np.uint32))),
-                mi.Float(with_space((1 / counts[places]).astype(np.float32))),
-                options.interpolation == "cubic",
-            )
-        )
+        scaled = mi.Vector3f(*map(with_space, (direction * factors[:, None]).T.astype(np.float32)))
+        maps.append(HeightMap(coordinates, scaled, merged, share, options.interpolation == "cubic"))
 
     def displaced(first: mi.Float, *heights: mi.TensorXf) -> mi.Float:
         for place, grid in zip(maps, heights, strict=True):
