@@ -300,7 +300,7 @@ class Evaluator:
             gradients[key] = gradient.copy() if shared else gradient
             dr.clear_grad(value)  # The scene refers to the variable, which would keep the gradient in memory.
         release(values)
-        if by_factor is not None and EXPOSURE in gradients:
+        if by_factor is not None:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
         if by_target is not None:
             gradients[RESPONSE] = response_gradient(values, about.target, np.array(by_target))
@@ -343,7 +343,7 @@ class Evaluator:
             self._sweeps[which],
             EXPOSURE in self._moving,
             RESPONSE in self._moving,
-            problem.debias,
+            problem.config.debias,
         )
         problem.disk.rest()
         with plain_errors():
