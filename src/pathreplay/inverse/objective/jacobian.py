@@ -19,7 +19,7 @@ from pathreplay.integrators.stateful import StatefulIntegrator
 from pathreplay.inverse.objective.frozen import Recordings, RenderRequest, linear_derivative
 from pathreplay.inverse.objective.shared_sensors import SharedSensors
 from pathreplay.inverse.parameters.exposures import EXPOSURE, derivatives_by_factors, factor_of
-from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Half, model_of
+from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Half, model_of, places
 from pathreplay.inverse.parameters.values import Array, Arrays, split
 from pathreplay.inverse.problem.problem import Problem, scene_values
 from pathreplay.platform import memory
@@ -81,17 +81,15 @@ class Jacobians:
         opaque = [half if self._sensors is None else dr.opaque(mi.UInt32, half) for half in seeds]
         a, b = (self._half(values, view, RenderRequest(about.sensor, half, spp // 2)) for half in opaque)
         dropped = {}
-        begin = 0
-        for key, size in sizes.items():
+        for key, here in places(sizes).items():
             lost = 0
-            for rows in zip(a.jacobian[begin : begin + size], b.jacobian[begin : begin + size], strict=True):
+            for rows in zip(a.jacobian[here], b.jacobian[here], strict=True):
                 finite = np.isfinite(rows[0]) & np.isfinite(rows[1])
                 lost += not finite.all()
                 for row in rows:
                     row[~finite] = 0
             if lost:
                 dropped[key] = lost
-            begin += size
         share = about.share / len(self.problem.trained())
         weight = None if about.weight is None else mi.TensorXf(with_space(about.weight))
         target = mi.TensorXf(with_space(about.target))

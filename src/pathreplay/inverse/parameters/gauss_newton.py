@@ -41,6 +41,12 @@ class Half:
     """Derivative of the image with respect to each of n entries, n x height x width x channels."""
 
 
+def places(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Return the place of each variable in an array of all entries, for variables of the given ``sizes``."""
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {key: slice(end - sizes[key], end) for key, end in zip(sizes, ends, strict=True)}
+
+
 @dataclass(frozen=True)
 class GaussNewton:
     """Model of a loss as a function of all entries of its variables.
@@ -76,9 +82,8 @@ class GaussNewton:
 
     def within(self, sizes: Mapping[str, int]) -> GaussNewton:
         """Return the model with additional variables, on which the loss does not depend."""
-        ends = dict(zip(sizes, np.cumsum(list(sizes.values())), strict=True))
-        at = np.concatenate([np.arange(ends[key] - n, ends[key]) for key, n in self.sizes.items()])
-        n = sum(sizes.values())
+        n, of = sum(sizes.values()), places(sizes)
+        at = np.concatenate([np.arange(n)[of[key]] for key in self.sizes])
         (matrix, robust, bias, noise), spread = np.zeros((4, n, n)), np.zeros(n)
         for whole, part in ((matrix, self.matrix), (robust, self.robust), (bias, self.bias), (noise, self.noise)):
             whole[np.ix_(at, at)] = part
@@ -87,16 +92,13 @@ class GaussNewton:
 
     def curved(self, key: str, matrix: Matrix) -> GaussNewton:
         """Add the curvature of a regularizer of one variable."""
-        before = 0
-        for name, n in self.sizes.items():
-            if name == key:
-                here = slice(before, before + n)
-                total, robust = self.matrix.copy(), self.robust.copy()
-                total[here, here] += matrix
-                robust[here, here] += matrix
-                return replace(self, matrix=total, robust=robust)
-            before += n
-        return self
+        if key not in self.sizes:
+            return self
+        here = places(self.sizes)[key]
+        total, robust = self.matrix.copy(), self.robust.copy()
+        total[here, here] += matrix
+        robust[here, here] += matrix
+        return replace(self, matrix=total, robust=robust)
 
     def mapped(self, gradients: Mapping[str, Callable[[Array], Array]]) -> GaussNewton:
         """Return the model in other coordinates.
@@ -104,13 +106,11 @@ class GaussNewton:
         Args:
             gradients: by key of a variable, the linear map of gradients to the new coordinates.
         """
-        n = sum(self.sizes.values())
-        change, begin = np.eye(n), 0
-        for key, size in self.sizes.items():
+        change = np.eye(sum(self.sizes.values()))
+        for key, here in places(self.sizes).items():
             if key in gradients:
-                rows = [gradients[key](np.eye(size)[k]).ravel() for k in range(size)]
-                change[begin : begin + size, begin : begin + size] = np.transpose(rows)
-            begin += size
+                n = self.sizes[key]
+                change[here, here] = np.transpose([gradients[key](np.eye(n)[k]).ravel() for k in range(n)])
         names = "matrix", "robust", "bias", "noise"
         return replace(
             self,
