@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.optimizer_options import Optimizer
-from pathreplay.inverse.optim.adaptive import Optimiser, State
+from pathreplay.inverse.optim.adaptive import State
+from pathreplay.inverse.optim.vectors import Vector, VectorOptimiser, flat, require_float64
 from pathreplay.inverse.parameters.values import Array, Arrays, split
 
 MOST = 1000
@@ -28,7 +29,6 @@ MOST = 1000
 
 ENDLESS = 10**9
 
-Vector = NDArray[np.float64]
 Search = Callable[..., object]
 """Minimiser ``search(function, start, jac=True, bounds=...)``, whose result may be any object; see `LineSearch`."""
 _START, _SCALE, _LOSSES, _GRADIENTS, _NEXT = (f"search:{n}" for n in ("start", "scale", "losses", "gradients", "next"))
@@ -38,7 +38,7 @@ class _Asked(Exception):
     """SciPy requests an evaluation that is not in the record."""
 
 
-class LineSearch(Optimiser):
+class LineSearch(VectorOptimiser):
     """`Optimiser` that runs a deterministic minimiser with bounds.
 
     The minimiser sees variables divided by their initial learning rates, and losses divided by the initial loss.
@@ -62,15 +62,8 @@ class LineSearch(Optimiser):
         bounds: Mapping[str, tuple[float, float]],
         search: Search | None = None,
     ) -> None:
-        self._shapes = {key: value.shape for key, value in values.items()}
-        n = sum(value.size for value in values.values())
-        if n > MOST:
-            raise PathreplayError(
-                f"The parameters have {n} entries, but optimizer type = '{options.type}' takes up to {MOST}; use 'adam'"
-            )
+        super().__init__(values, bounds, options.type, MOST, "'adam'")
         self._search = partial(_of_scipy, **options.options()) if search is None else search
-        ends = [np.broadcast_to(np.array(bounds[key], float), (value.size, 2)) for key, value in values.items()]
-        self._bounds = np.concatenate(ends)
         self._start, self._scale, self._next = np.zeros(0), np.zeros(0), np.zeros(0)
         self._points: list[Vector] = []
         self._losses: list[float] = []
@@ -84,9 +77,9 @@ class LineSearch(Optimiser):
             return self.answer(values)
         if not self._losses:
             self._scale = np.concatenate([np.full(value.size, rates[key]) for key, value in values.items()])
-            self._start = _flat(values) / self._scale
+            self._start = flat(values) / self._scale
         self._losses.append(float(loss))
-        self._gradients.append(_flat({key: gradients[key] for key in values}) * self._scale)
+        self._gradients.append(flat({key: gradients[key] for key in values}) * self._scale)
         self._ask()
         return self.answer(values) if self.finished else split(self._next * self._scale, self._shapes)
 
@@ -143,19 +136,14 @@ class LineSearch(Optimiser):
         return State(steps, arrays)
 
     def restore(self, state: State, values: Arrays) -> None:
-        n = len(self._bounds)
-        (count,) = {state.steps[key] for key in values} or {0}
-        if {key: value.shape for key, value in values.items()} != self._shapes:
-            raise ValueError("the shapes of its parameters differ")
-        if rest := set(state.arrays) - {_START, _SCALE, _LOSSES, _GRADIENTS, _NEXT}:
-            raise ValueError(f"'{min(rest)}' is not a state array of this optimizer")
+        n = self._n
+        count = self._steps_of(state, values, {_START, _SCALE, _LOSSES, _GRADIENTS, _NEXT})
         self.finished, self._points, self._losses, self._gradients = "", [], [], []
         if not count:
             return
         shapes = {_START: (n,), _SCALE: (n,), _LOSSES: (count,), _GRADIENTS: (count, n), _NEXT: (n,)}
         for name, array in state.arrays.items():
-            if array.shape != shapes[name] or array.dtype != np.float64:
-                raise ValueError(f"'{name}' is {array.dtype} of shape {array.shape}, not float64 of {shapes[name]}")
+            require_float64(name, array, shapes[name])
         self._start, self._scale = (np.asarray(state.arrays[name], np.float64) for name in (_START, _SCALE))
         if (self._scale <= 0).any():
             raise ValueError(f"'{_SCALE}' is not positive")
@@ -176,7 +164,3 @@ def _of_scipy(
 ) -> object:
     options = {"maxcor": history_size, "ftol": tolerance, "gtol": 0.0, "maxfun": ENDLESS, "maxiter": ENDLESS}
     return scipy.optimize.minimize(function, start, method="L-BFGS-B", options=options, **more)
-
-
-def _flat(arrays: Arrays) -> Vector:
-    return np.concatenate([np.ravel(array).astype(np.float64) for array in arrays.values()])

@@ -25,9 +25,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.optimizer_options import Optimizer
-from pathreplay.inverse.optim.adaptive import Optimiser, State
+from pathreplay.inverse.optim.adaptive import State
+from pathreplay.inverse.optim.vectors import VectorOptimiser, flat, require_float64
 from pathreplay.inverse.parameters.gauss_newton import GaussNewton, Matrix
 from pathreplay.inverse.parameters.values import Array, Arrays, split
 
@@ -83,7 +83,7 @@ class Point:
     model: GaussNewton
 
 
-class LevenbergMarquardt(Optimiser):
+class LevenbergMarquardt(VectorOptimiser):
     """Levenberg-Marquardt with bounds, as an `Optimiser`: `observe` has to precede each `step`.
 
     Learning rates have no effect.
@@ -98,18 +98,11 @@ class LevenbergMarquardt(Optimiser):
     """
 
     def __init__(self, values: Arrays, options: Optimizer, bounds: Mapping[str, tuple[float, float]]) -> None:
-        self._shapes = {key: value.shape for key, value in values.items()}
+        super().__init__(values, bounds, options.type, MOST, "'adam' or 'l-bfgs-b'")
         self._sizes = {key: value.size for key, value in values.items()}
-        self._n = sum(self._sizes.values())
-        if self._n > MOST:
-            raise PathreplayError(
-                f"The parameters have {self._n} entries, but optimizer type = '{options.type}' takes up to {MOST}; "
-                "use 'adam' or 'l-bfgs-b'"
-            )
         given = options.options()
         self._initial, self._tolerance = float(given["damping"]), float(given["tolerance"])  # type: ignore[arg-type]
-        ends = [np.broadcast_to(np.array(bounds[key], float), (value.size, 2)) for key, value in values.items()]
-        self._low, self._high = np.concatenate(ends).T
+        self._low, self._high = self._bounds.T
         self._model: GaussNewton | None = None
         self._reset()
 
@@ -138,9 +131,7 @@ class LevenbergMarquardt(Optimiser):
         """See `Optimiser`; returns the next point to evaluate."""
         model, self._model = self._model, None
         assert model is not None, "observe() has to precede step()"
-        at, gradient = (np.concatenate([a[key].ravel() for key in values]) for a in (values, gradients))
-        at, gradient = at.astype(np.float64), gradient.astype(np.float64)
-        seen = Point(at, loss - model.excess, gradient, model)
+        seen = Point(flat(values), loss - model.excess, flat({key: gradients[key] for key in values}), model)
         self._steps += 1
         if self.finished:
             return self.answer(values)
@@ -284,11 +275,7 @@ class LevenbergMarquardt(Optimiser):
         return State(steps, {_NAMES[name]: array for name, array in named.items()})
 
     def restore(self, state: State, values: Arrays) -> None:
-        (count,) = {state.steps[key] for key in values} or {0}
-        if {key: value.shape for key, value in values.items()} != self._shapes:
-            raise ValueError("the shapes of its parameters differ")
-        if rest := set(state.arrays) - set(_NAMES.values()):
-            raise ValueError(f"'{min(rest)}' is not a state array of this optimizer")
+        count = self._steps_of(state, values, _NAMES.values())
         self._reset()
         self._steps = count
         if not count:
@@ -298,9 +285,7 @@ class LevenbergMarquardt(Optimiser):
         shapes |= dict.fromkeys(("matrix", "robust", "bias", "noise"), (n, n))
         shapes["numbers"] = (len(_CONTROLS + _COUNTS),)
         for name, full in _NAMES.items():
-            array = state.arrays[full]
-            if array.shape != shapes[name] or array.dtype != np.float64:
-                raise ValueError(f"'{full}' is {array.dtype} of shape {array.shape}, not float64 of {shapes[name]}")
+            require_float64(full, state.arrays[full], shapes[name])
         saved = {name: np.array(state.arrays[full], np.float64) for name, full in _NAMES.items()}
         loss, excess, self._damping, self._growth, self._predicted, self._first = saved["numbers"][
             : len(_CONTROLS)
