@@ -13,7 +13,7 @@ import pytest
 
 from edge_scenes import BY_NAME, INDIRECT, SHADOWS, VEILED
 from edge_truth import backwards, hold_forward, hold_gradients, hold_need, loaded, reference, some
-from pathreplay.boundary import observer, occlusion
+from pathreplay.boundary import observer
 from pathreplay.boundary.emitters import ShadowCrossing
 from pathreplay.integrators import boundary_term as boundary
 from pathreplay.integrators import integrator as integrators
@@ -63,7 +63,7 @@ def test_nor_do_they_where_edges_ignore_what_the_interior_follows(name: str, mon
     """
     monkeypatch.setattr(integrators, "can_follow", lambda trace, sensor: False)
     arrival, kept = observer.Arrival, (mi.Bool(True), mi.Bool(False))
-    monkeypatch.setattr(occlusion, "moved_direction", lambda lengths, origin, d, hit, active: (d, mi.Float(1)))
+    monkeypatch.setattr(observer, "moved_direction", lambda lengths, origin, d, hit, active: (d, mi.Float(1)))
     monkeypatch.setattr(observer, "Arrival", lambda ray, hit, pdf, *_: arrival(ray, hit, pdf, *kept))
     monkeypatch.setattr(ShadowCrossing, "weighted", lambda self, *_: replace(self, weight=mi.Spectrum(0)))
     differences = reference(name)
