@@ -197,6 +197,19 @@ def test_bitmaps_without_interpolation_are_found_before_their_texels_differ(filt
     assert has_seams([mi.load_dict(painting)]) is (filter == "nearest")
 
 
+@pytest.mark.parametrize("filter", ["bilinear", "nearest"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_bitmaps_without_interpolation_are_found_where_their_texels_have_gradients(filter: str, channels: int) -> None:
+    painting = {"type": "bitmap", "raw": True, "data": dr.full(mi.TensorXf, 0.5, (8, 8, channels))}
+    texture = mi.load_dict({**painting, "filter_type": filter})
+    params = mi.traverse(texture)
+    dr.enable_grad(params["data"])
+    params.update()
+    for suspended in (False, True):
+        with dr.suspend_grad(when=suspended):
+            assert has_seams([texture]) is (filter == "nearest")
+
+
 def test_attributes_of_faces_have_seams_and_those_of_vertices_none() -> None:
     for name, seams in (("face_color", True), ("vertex_color", False)):
         assert has_seams([mi.load_dict({"type": "mesh_attribute", "name": name})]) is seams

@@ -36,9 +36,10 @@ def _is_nearest(texture: mi.Texture) -> bool:
     """
     raw = texture.eval_3 if mi.traverse(texture)["data"].shape[2] == 3 else texture.eval_1
     values = raw if "raw = 1" in str(texture) else texture.eval
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    if mi.is_spectral:
+        si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
     with dr.resume_grad():
-        si = dr.zeros(mi.SurfaceInteraction3f)
         dr.enable_grad(si.uv)
-        if mi.is_spectral:
-            si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
+    with dr.suspend_grad(), dr.resume_grad(si.uv):  # the texels may have gradients, too
         return not dr.grad_enabled(values(si))
