@@ -151,20 +151,26 @@ from pathreplay.platform.backend import set_variant
 set_variant(sys.argv[1])
 import mitsuba as mi
 band = {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}
-film = {"type": "specfilm", "width": 4, "height": 4, "band": band}
-eye = {"type": "perspective", "fov": 40, "film": film, "id": "eye"}
-scene = mi.load_dict({"type": "scene", "eye": eye, "lamp": {"type": "point"}})
-try:
-    mi.load_dict({"type": "pathreplay_particles"}).render(scene, spp=1)
-except Exception as error:
-    print(type(error).__name__, error)
+size = {"width": 4, "height": 4}
+of_spectra = {"film": {"type": "specfilm", "band": band, **size}}
+responds = {"film": {"type": "hdrfilm", **size}, "srf": {"type": "uniform", "value": 0.5}}
+for parts in (of_spectra, responds):
+    eye = {"type": "perspective", "fov": 40, "id": "eye", **parts}
+    scene = mi.load_dict({"type": "scene", "eye": eye, "lamp": {"type": "point"}})
+    try:
+        mi.load_dict({"type": "pathreplay_particles"}).render(scene, spp=1)
+    except Exception as error:
+        print(type(error).__name__, error)
 """
 
 
-def test_films_of_spectra_are_refused_in_one_line(run_python: Callable[..., Any]) -> None:
+def test_films_of_spectra_and_spectral_responses_are_refused_in_one_line(run_python: Callable[..., Any]) -> None:
     done = run_python(SPECTRA, args=(SPECTRAL,))
-    expected = "PathreplayError light paths cannot be added to the film of sensor 'eye': a SpecFilm stores spectra"
-    assert done.returncode == 0 and done.stdout.strip().splitlines()[-1].startswith(expected), done
+    assert done.returncode == 0, done
+    film, response = done.stdout.strip().splitlines()[-2:]
+    line = "PathreplayError light paths cannot be"
+    assert film.startswith(f"{line} added to the film of sensor 'eye': a SpecFilm stores spectra")
+    assert response.startswith(f"{line} weighted by the spectral response of sensor 'eye': remove its 'srf'")
 
 
 PROPERTIES: dict[str, tuple[dict, str]] = {

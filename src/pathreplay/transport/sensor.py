@@ -131,3 +131,17 @@ class SensorLink:
         sees = active & (to.pdf > 0) & (dr.dot(to.n, to.d) < 0)
         W = dr.select(sees, dr.rcp(dr.select(sees, to.pdf, 1) * shape.surface_area()), 0)
         return Sighting(to.d, to.p, mi.Point2f(0.5), W, sees)
+
+
+def require_no_response(sensor: mi.Sensor) -> None:
+    """Raise PathreplayError if a sensor has a spectral response (``srf``), which Mitsuba does not expose.
+
+    Such a sensor samples other wavelengths than a sensor without response. For spectral variants.
+    """
+    u, si = mi.Float(0.5), dr.zeros(mi.SurfaceInteraction3f)
+    apart = sensor.sample_wavelengths(si, u)[0][0] - mi.sample_rgb_spectrum(u)[0]
+    if abs(apart[0]) > 1e-3:  # nm
+        raise PathreplayError(
+            f"light paths cannot be weighted by the spectral response of sensor '{sensor.id()}': remove its 'srf', or "
+            "trace all paths from the sensor"
+        )

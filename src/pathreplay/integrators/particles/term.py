@@ -12,12 +12,14 @@ from pathreplay.adjoint.baseline import Baseline
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.image import picture_shape
+from pathreplay.integrators.lifetimes import is_recording
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.particles.film import ParticleFilm
 from pathreplay.particles.paths import Particles, link_of, particle_image, particle_sweep, particle_tangent
 from pathreplay.particles.start import Emission
 from pathreplay.samplers.owen_sobol import key_of
 from pathreplay.samplers.streams import Stream
+from pathreplay.transport.sensor import require_no_response
 from pathreplay.transport.vertex import TraceConfig
 
 
@@ -74,6 +76,8 @@ class ParticleTerm(Term):
         if emission is None:
             return None
         film = ParticleFilm.of(view.sensor)
+        if mi.is_spectral and not is_recording():
+            require_no_response(view.sensor)
         key = key_of(view.opaque_seed, mi.UInt32(int(Stream.PARTICLES)))
         trace = link_of(replace(trace, max_depth=self.max_depth), view.sensor, self.caustics)
         emission = emission.surrounded(trace)
