@@ -81,8 +81,7 @@ def particle_image(trace: TraceConfig, particles: Particles, film: ParticleFilm)
 
     while dr.hint(i < number, exclude=[trace, particles, film, sums], label="pathreplay: particles"):
         start = particles.start(trace, i)
-        _, W = start.emit()
-        splat_path(trace, start.sampler, PathState.begin(trace, start), W, film, sums)
+        splat_path(trace, start.sampler, PathState.begin(trace, start), start.W, film, sums)
         i += lanes
 
     return film.develop(sums * film.scale(particles.number))
@@ -120,7 +119,7 @@ def particle_tangent(
         with dr.resume_grad():
             ray0, W0 = start.emit()
             δo, δd, δβ = tangents(ray0.o, ray0.d, W0)
-        W = dr.detach(W0)
+        W = start.W
         δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))
         path = PathState.begin(trace, start, sustained=True)
         sampler, broken = start.sampler, mi.Bool(False)
@@ -194,7 +193,6 @@ def particle_sweep(
         label="pathreplay: particles",
     ):
         start = particles.start(trace, i)
-        _, W = start.emit()
         path = PathState.begin(trace, start, sustained=True)
         ray0 = path.at.ray
         records, count, L, _beyond, _branch = record_path(
@@ -203,7 +201,7 @@ def particle_sweep(
         q = RayDerivative.zero()
         if dr.hint(varies, mode="scalar"):
             recorded = RecordedPath(layout, records, mi.UInt32(0), count, count - 1, ray0)
-            swept = sweep_path(trace, recorded, PathAdjoint(W, mi.Spectrum(0), q), lost)
+            swept = sweep_path(trace, recorded, PathAdjoint(start.W, mi.Spectrum(0), q), lost)
             L, q = swept.L, swept.q
         if dr.hint(starts, mode="scalar"):
             with dr.resume_grad():

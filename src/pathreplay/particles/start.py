@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -158,13 +158,16 @@ class Emission:
             o, d = _from_sphere(each, ray.d, u.place)
             here = emitter == mi.EmitterPtr(each)
             ray.o, ray.d = dr.select(here, o, ray.o), dr.select(here, d, ray.d)
-        if trace.traits.lights_deform:
-            # Mitsuba's `sample_ray` omits the derivative of the areas of triangles, unless the radiance is textured.
-            hit, back, on_mesh = _origin(trace, emitter, ray, active)
-            weight *= area_growth(hit, back, on_mesh & ~mi.Bool(is_painted(emitter)))
-        if self.rounded:
-            rounded = active & _is_one_of(self.rounded, emitter)
-            weight = dr.select(~rounded | _outwards(trace, emitter, ray, rounded), weight, 0)
+        rounded = active & _is_one_of(self.rounded, emitter)
+        if trace.traits.lights_deform or self.rounded:
+            origin = _origin(trace, emitter, ray, active if trace.traits.lights_deform else rounded)
+            if trace.traits.lights_deform:
+                # Mitsuba's `sample_ray` omits the derivative of the areas of triangles, unless the radiance is
+                # textured.
+                hit, back, on_mesh = origin
+                weight *= area_growth(hit, back, on_mesh & ~mi.Bool(is_painted(emitter)))
+            if self.rounded:
+                weight = dr.select(~rounded | _outwards(*origin), weight, 0)
         return ray, weight * dr.detach(reciprocal(probability))
 
 
@@ -203,8 +206,7 @@ def _has_smooth_mesh(emitter: mi.Emitter) -> bool:
 def _is_uniform_sphere(emitter: mi.Emitter) -> bool:
     """Return whether Mitsuba samples origins uniformly on a sphere, as it does unless the radiance is textured."""
     shape = emitter.get_shape()
-    textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-    return shape is not None and shape.class_name() == SPHERE and not textured
+    return shape is not None and shape.class_name() == SPHERE and not is_painted(emitter)
 
 
 def _from_sun(
@@ -248,14 +250,13 @@ def _origin(
     return hit, back, active & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == emitter)
 
 
-def _outwards(trace: TraceConfig, emitter: mi.EmitterPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-    """Return whether a ray leaves its mesh emitter on the outside.
+def _outwards(hit: mi.PreliminaryIntersection3f, back: mi.Ray3f, on_mesh: mi.Bool) -> mi.Bool:
+    """Return whether a ray leaves its mesh emitter on the outside. The arguments are those that `_origin` returns.
 
     Mitsuba samples directions around the interpolated normal. Some of these directions point below the triangle, so
     that the mesh itself blocks the light. Such rays must be rejected, because Mitsuba offsets their origins to the
     outside, and they would then hit the mesh.
     """
-    hit, back, on_mesh = _origin(trace, emitter, ray, active)
     n = hit.compute_surface_interaction(back, compat.shading(), on_mesh).n
     reach = CLOSE * mi.math.RayEpsilon * (1 + dr.max(dr.abs(back.o)))
     return on_mesh & (hit.t < reach) & (dr.dot(n, back.d) < 0)
@@ -277,15 +278,20 @@ class EmitterStart:
     u: EmitterSamples
     sampler: Sampler  # source of the random numbers of the path
     active: mi.Bool
+    ray: mi.Ray3f = field(init=False)  # the first ray, detached
+    W: mi.Spectrum = field(init=False)  # the weight of this ray, detached
+
+    def __post_init__(self) -> None:
+        self.ray, self.W = dr.detach(self.emit())
 
     def emit(self) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Return the first ray and its weight, differentiably: see `Emission.emit`."""
         return self.emission.emit(self.trace, self.u, self.active)
 
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
-        ray, _ = dr.detach(self.emit())
+        ray = mi.Ray3f(self.ray)
         hit = meet(trace, ray, active)
-        at = Arrival(ray=mi.Ray3f(ray), hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
+        at = Arrival(ray=ray, hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
         if trace.media is not None:
             at.medium = medium_at_origin(trace, ray, hit, self.emission.outside, active)
             at.behind = mi.Float(0)
