@@ -108,7 +108,8 @@ def triangle_sides(
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Return two sides of the triangle that was hit: the vectors from its first corner to the other two corners.
 
-    The sides carry the same derivatives as the corners; see `triangle_corners`.
+    The sides carry the same derivatives as the corners (see `triangle_corners`), except in instances: there, Mitsuba
+    3.9 returns sides in the coordinates of the mesh.
     """
     if _SHADING in mi.RayFlags.__members__:
         a, b, c = triangle_corners(hit, ray, active)

@@ -16,7 +16,7 @@ from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.emitters import emission, vertex_glow
 from pathreplay.transport.facts.traits import is_null
 from pathreplay.transport.surface import met, steady
-from pathreplay.transport.vertex import Arrival, Flight, Signature, TraceConfig, VertexRecord
+from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexRecord
 from pathreplay.transport.volume.flight import Flown, fly, fly_again
 from pathreplay.transport.volume.media import interaction
 
@@ -33,12 +33,9 @@ class Vertex:
     inside: InMedium = None  # type: ignore[assignment]  # None in scenes without media
     n: mi.Vector3f = None  # type: ignore[assignment]  # differentiable geometric normal in the shading frame; None on camera paths
 
-    def signature(self, at: Arrival, lobe: mi.UInt32, go_on: mi.Bool) -> Signature:
-        """Return the discrete choices at the vertex. ``go_on`` is False at the last vertex of a path."""
-        met, shape = self.si.is_valid(), dr.reinterpret_array(mi.UInt32, at.hit.shape)
-        if self.inside is not None:
-            met, shape = self.surface | (self.inside.event & go_on), dr.select(self.inside.event, 0, shape)
-        return Signature(met, shape, lobe)
+    def met(self, go_on: mi.Bool) -> mi.Bool:
+        """Return whether the ray hit a surface or had a collision. Collisions at the end of a path do not count."""
+        return self.si.is_valid() if self.inside is None else self.surface | (self.inside.event & go_on)
 
     def medium(self, d: mi.Vector3f) -> mi.MediumPtr:
         """Return the medium along a ray that leaves the vertex in direction ``d``, in a scene with media."""
@@ -74,11 +71,9 @@ def choose(
     if trace.media is None:
         return _on_surface(trace, at, si, False, active)
     flight = fly(trace, at, sampler, β, active) if flight is None else flight
-    event = active & flight.event
     mei = interaction(at.medium, dr.detach(at.ray), flight.t)
-    w = dr.select(event, flight.σ_s * dr.rcp(flight.density), 1) * flight.W
     e = mi.Spectrum(0 if flight.E is None else flight.E)
-    return _in_medium(trace, at, si, flight, Flown(mei, w, e), False, active)
+    return _in_medium(trace, at, si, flight, Flown(mei, flight.weight, e), False, active)
 
 
 def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Vertex:

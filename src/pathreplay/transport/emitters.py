@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from pathreplay.transport.facts.traits import is_painted
 from pathreplay.transport.meet import meet
-from pathreplay.transport.surface import surface_point
+from pathreplay.transport.surface import solid_angle, surface_point
 from pathreplay.transport.vertex import Arrival, Lighting, TraceConfig, mis_weight, reciprocal
 from pathreplay.transport.volume.passage import skip_null
 
@@ -104,16 +104,12 @@ def _at_fixed_point(
     """
     hit, ray = _hit_of_sample(trace, origin, still, active)
     y = surface_point(hit, ray, active)
-    towards = y.p - origin.p
-    facing = dr.abs(dr.dot(y.A, towards))
-    ok = active & hit.is_valid() & (hit.shape.emitter() == still.emitter) & (facing > 0)
-    dist2 = dr.select(ok, dr.squared_norm(towards), 1)
-    # Up to a constant, log_J is the log of the solid angle of an area element at y, as seen from the origin.
-    log_J = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
+    on_emitter = active & hit.is_valid() & (hit.shape.emitter() == still.emitter)
+    ok, dist2, log_J = solid_angle(y, origin.p, on_emitter)
     J = dr.replace_grad(mi.Float(1), log_J)
     light = dr.copy(still)
     light.p = dr.select(ok, dr.replace_grad(still.p, y.p), still.p)
-    light.d = dr.select(ok, dr.replace_grad(still.d, towards * dr.rsqrt(dist2)), still.d)
+    light.d = dr.select(ok, dr.replace_grad(still.d, (y.p - origin.p) * dr.rsqrt(dist2)), still.d)
     light.dist = dr.select(ok, dr.replace_grad(still.dist, dr.sqrt(dist2)), still.dist)
     light.pdf = dr.select(ok, dr.replace_grad(still.pdf, -still.pdf * log_J), still.pdf)
     Le = trace.scene.eval_emitter_direction(dr.detach(origin), still, active) * reciprocal(still.pdf)

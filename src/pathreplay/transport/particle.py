@@ -70,11 +70,8 @@ def choose_step(
         going &= ~first | kept.delta
     kept.lit = lit
     splat = Splat(dr.select(lit, c, 0), to.s)
-    e, signature = _weighted(link, splat, at, lit), v.signature(at, kept.lobe, go_on)
-    return SampledStep(
-        e, w, v.origin.spawn_ray(kept.d), kept.pdf, signature, kept, mi.Float(1), sampled.null, going, medium,
-        splat=splat,
-    )  # fmt: skip
+    e, ray_next, met = _weighted(link, splat, at, lit), v.origin.spawn_ray(kept.d), v.met(go_on)
+    return SampledStep(e, w, ray_next, kept.pdf, met, kept, mi.Float(1), sampled.null, going, medium, splat=splat)
 
 
 def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Step:
@@ -89,8 +86,7 @@ def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active:
         T = shadow_again(trace, v.origin.spawn_ray_to(to.end), again.kept.media.shadow, attached, lit)
         c, w = v.inside.w * T * c, v.inside.w * w
     splat = Splat(dr.select(lit, c, 0), to.s)
-    signature = v.signature(again.at, again.kept.lobe, again.go_on)
-    return Step(_weighted(link, splat, again.at, lit), w, v.origin.spawn_ray(d), pdf, signature, splat=splat)
+    return Step(_weighted(link, splat, again.at, lit), w, v.origin.spawn_ray(d), pdf, splat=splat)
 
 
 def _link(trace: TraceConfig) -> SensorLink:

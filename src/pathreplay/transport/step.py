@@ -62,8 +62,8 @@ def choose_step(
         w_light = to.f * (link.mis(to.pdf_light) * reciprocal(link.light.pdf))
         seen = arrive.sees_lights(trace, at, v.si, active)
         lighting = Lighting(v.si, seen, link.light, dr.select(link.lit, w_light, 0), link.lit)
-    ray_next, signature = v.origin.spawn_ray(kept.d), v.signature(at, kept.lobe, go_on)
-    return SampledStep(e, w, ray_next, kept.pdf, signature, kept, to.eta, to.null, to.active, medium, lighting)
+    ray_next, met = v.origin.spawn_ray(kept.d), v.met(go_on)
+    return SampledStep(e, w, ray_next, kept.pdf, met, kept, to.eta, to.null, to.active, medium, lighting)
 
 
 def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Step:
@@ -81,4 +81,4 @@ def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active:
     w, d, pdf = scatter.repeat(trace, v, again, ctx, attached)
     if v.inside is not None:
         e, w = v.inside.e + v.inside.w * e, v.inside.w * w
-    return Step(e, w, v.origin.spawn_ray(d), pdf, v.signature(again.at, again.kept.lobe, again.go_on))
+    return Step(e, w, v.origin.spawn_ray(d), pdf)

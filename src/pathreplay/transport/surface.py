@@ -103,6 +103,19 @@ def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
     return SurfacePoint(y.p, A, dr.detach(y.n), dr.select(on_mesh, 0, _curvature(dr.detach(y))))
 
 
+def solid_angle(y: SurfacePoint, origin: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Float, mi.Float]:
+    """Return the log of the solid angle of the area element at ``y``, as seen from ``origin``, up to a constant.
+
+    Returns a mask of the lanes in which the solid angle is not zero, the squared distance of ``y``, and the logarithm.
+    The logarithm is used because powers of the tiny distances in corners would overflow.
+    """
+    towards = y.p - origin
+    facing = dr.abs(dr.dot(y.A, towards))
+    ok = active & (facing > 0)
+    dist2 = dr.select(ok, dr.squared_norm(towards), 1)
+    return ok, dist2, dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
+
+
 def _curvature(y: mi.SurfaceInteraction3f) -> mi.Float:
     """Return the curvature κ of a surface: dn = κ dp for the normal n and point p. Infinite if no such κ exists."""
     turn = dr.squared_norm(y.dn_du) + dr.squared_norm(y.dn_dv)

@@ -36,7 +36,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.transport.surface import SurfacePoint, surface_point
+from pathreplay.transport.surface import SurfacePoint, solid_angle, surface_point
 
 # Length h0 relative to the size of the shape that was hit. A larger value gives less noise. Without boundary terms, a
 # larger value also omits more of the derivative due to moving edges nearby. docs/gradients.md has measurements for
@@ -63,13 +63,10 @@ def moved_direction(
     """
     valid = active & hit.is_valid()
     y = surface_point(hit, dr.detach(origin.spawn_ray(d)), valid)
-    towards = y.p - origin.spawn_ray(dr.detach(d)).o
-    facing = dr.abs(dr.dot(y.A, towards))
-    ok = valid & (facing > 0)
-    dist2 = dr.select(ok, dr.squared_norm(towards), 1)
+    start = origin.spawn_ray(dr.detach(d)).o
+    towards = y.p - start
+    ok, dist2, log_J_H = solid_angle(y, start, valid)
     d_H = towards * dr.rsqrt(dist2)
-    # log J is differentiated instead of J, because powers of the tiny distances in corners would overflow.
-    log_J_H = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
 
     h0 = blend_length_at(lengths, hit, ok)
     n_x = dr.detach(origin.n)

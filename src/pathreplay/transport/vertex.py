@@ -243,15 +243,6 @@ class VertexRecord:
 
 
 @dataclass
-class Signature:
-    """The discrete choices at a vertex. Paths with different signatures are separated by a discontinuity."""
-
-    met: mi.Bool  # the ray hit a surface or had a real collision in a medium
-    shape: mi.UInt32  # registry index of the shape, 0 in a medium or on a miss
-    lobe: mi.UInt32  # the lobe of the continuation
-
-
-@dataclass
 class Splat:
     """The contribution of a vertex of a light path to the film, without the throughput up to this vertex."""
 
@@ -269,7 +260,6 @@ class Step:
     w: mi.Spectrum  # f/p of a smooth lobe, or the weight of a delta lobe, without Russian roulette
     ray_next: mi.Ray3f
     pdf: mi.Float  # density of the continuation, for the MIS weight at the next vertex
-    signature: Signature
     splat: Splat | None = field(default=None, kw_only=True)  # contribution to the film; None on camera paths
 
 
@@ -277,6 +267,7 @@ class Step:
 class SampledStep(Step):
     """A step of the sampling pass, with its choices and the state that the next vertex needs."""
 
+    met: mi.Bool  # the ray hit a surface or had a real collision in a medium
     kept: SampledContinuation
     eta: mi.Float  # relative index of refraction across the continuation
     null: mi.Bool  # the continuation passes the surface unscattered
@@ -287,7 +278,7 @@ class SampledStep(Step):
     @property
     def seen(self) -> mi.Bool:
         """Mitsuba's alpha: whether the ray was scattered or absorbed at a surface, or had a real collision."""
-        return self.signature.met & ~self.null
+        return self.met & ~self.null
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:

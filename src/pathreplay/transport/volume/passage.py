@@ -81,7 +81,6 @@ def transmittance_up_to(
     return T, stretch.medium
 
 
-@dr.syntax
 def medium_at_origin(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, outside: mi.MediumPtr, active: mi.Bool
 ) -> mi.MediumPtr:
@@ -90,34 +89,40 @@ def medium_at_origin(
     It is the medium before the first surface on the ray that separates media. If there is no such surface, it is
     ``outside``, the medium around the whole scene (see `medium_at_end`).
     """
-    medium = mi.MediumPtr(outside)
-    if dr.hint(trace.media.bounded, mode="scalar"):
-        here, onward = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray)
-        searching = active & here.is_valid()
-        while dr.hint(searching, exclude=[trace], label="pathreplay: medium around an emitter"):
-            si = here.compute_surface_interaction(onward, compat.minimal(), searching)
-            turns = searching & si.is_medium_transition()
-            medium = dr.select(turns, si.target_medium(-onward.d), medium)
-            onward = si.spawn_ray(onward.d)
-            searching &= ~turns
-            here = meet(trace, onward, searching)
-            searching &= here.is_valid()
-    return medium
+    return _medium_along(trace, ray, hit, outside, active, to_end=False)
+
+
+def medium_at_end(trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr) -> mi.MediumPtr:
+    """Return the medium in which a ray ends that starts in ``medium`` and passes all surfaces. Detached."""
+    return _medium_along(trace, ray, meet(trace, ray, mi.Bool(True)), medium, mi.Bool(True), to_end=True)
 
 
 @dr.syntax
-def medium_at_end(trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr) -> mi.MediumPtr:
-    """Return the medium in which a ray ends that starts in ``medium`` and passes all surfaces. Detached."""
-    medium, onward = mi.MediumPtr(medium), mi.Ray3f(ray)
+def _medium_along(
+    trace: TraceConfig,
+    ray: mi.Ray3f,
+    hit: mi.PreliminaryIntersection3f,
+    otherwise: mi.MediumPtr,
+    active: mi.Bool,
+    to_end: bool,
+) -> mi.MediumPtr:
+    """Return the medium before the first surface on a ray that separates media, or behind the last such surface.
+
+    The search goes ``to_end`` for the last surface. The result is ``otherwise`` if there is no such surface. ``hit`` is
+    the first hit of the ray.
+    """
+    medium = mi.MediumPtr(otherwise)
     if dr.hint(trace.media.bounded, mode="scalar"):
-        here = meet(trace, onward, mi.Bool(True))
-        passing = here.is_valid()
-        while dr.hint(passing, exclude=[trace], label="pathreplay: medium around the scene"):
-            si = here.compute_surface_interaction(onward, compat.minimal(), passing)
-            medium = dr.select(si.is_medium_transition(), si.target_medium(onward.d), medium)
+        here, onward = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray)
+        searching = active & here.is_valid()
+        while dr.hint(searching, exclude=[trace, to_end], label="pathreplay: medium at an end of a ray"):
+            si = here.compute_surface_interaction(onward, compat.minimal(), searching)
+            turns = searching & si.is_medium_transition()
+            medium = dr.select(turns, si.target_medium(onward.d if to_end else -onward.d), medium)
             onward = si.spawn_ray(onward.d)
-            here = meet(trace, onward, passing)
-            passing &= here.is_valid()
+            searching &= ~turns | to_end
+            here = meet(trace, onward, searching)
+            searching &= here.is_valid()
     return medium
 
 
