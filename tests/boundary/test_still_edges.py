@@ -80,3 +80,27 @@ def test_the_outline_of_static_glass_counts_little(key: str, outline: float, ins
             for x in (mi.Float(3.0, 7.7), mi.Float(6.0, 8.3))
         )
         np.testing.assert_allclose(a.edge_importance(b), [outline, inside])
+
+
+def test_static_hard_shadows_are_no_edges() -> None:
+    """A point light casts the shadows of a static ball and of a moving ball onto a wall."""
+    film = {"type": "hdrfilm", "width": 16, "height": 16}
+    eye = {"type": "perspective", "fov": 60, "to_world": T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]), "film": film}
+    scene = {
+        "type": "scene",
+        "camera": eye,
+        "wall": {"type": "rectangle", "to_world": T().translate([0, 0, -2]).scale(6)},
+        "static": {"type": "sphere", "center": [0, 1, 0], "radius": 0.3},
+        "ball": {"type": "sphere", "center": [0, -1, 0], "radius": 0.3},
+        "lamp": {"type": "point", "position": [3, 0, 4]},
+    }
+    scene = attached(mi.load_dict(scene), "ball.to_world")
+    ours, view = mi.load_dict({"type": "pathreplay", "max_depth": 3}), Pass.of(scene, 0, 0, 1)
+    with dr.suspend_grad():
+        chain = chain_config(Boundary.informed(view, ours._trace_config(scene, view.sensor)))
+        places, key, lanes = FilmPlaces.of(view), mi.UInt32(7, 7), mi.Bool(True, True)
+        dark, lit = (
+            probe_chain(chain, places.ray(places.of_point(p)[0], key)[0], key, lanes, mi.Bool(False))
+            for p in (mi.Point3f(-1.5, mi.Float(1.5, -1.5), -2), mi.Point3f(-1.5, mi.Float(0.1, -0.1), -2))
+        )
+        np.testing.assert_allclose(dark.edge_importance(lit), [0, 1])

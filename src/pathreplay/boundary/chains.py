@@ -73,7 +73,10 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
         moves |= may_move(trace, path.at.hit)
         vertex_probe = dr.select(moves, _probe_vertex(trace, path, key, path.active & moves), VisibilityProbe.of())
         if dr.hint(tests_shadows(trace), mode="scalar"):
-            dark = _shadow_test(trace, path.at, key, path.depth, path.active).dark
+            test = _shadow_test(trace, path.at, key, path.depth, path.active)
+            dark = test.dark
+            if dr.hint(trace.to_sensor is None, mode="scalar"):
+                dark &= moves | may_move(trace, test.hit)
             vertex_probe.signature = mixed(vertex_probe.signature, dr.select(dark, mi.UInt32(1), 0))
         slides = _slides(trace, path.at)
         if dr.hint(trace.to_sensor is not None and trace.to_sensor.caustics, mode="scalar"):
