@@ -1,6 +1,6 @@
 """Differentiates a single step of a path in reverse or forward mode.
 
-No other module differentiates the step of a path.
+Other modules differentiate with `backward`, `tangents` and the `derivative_by_*` functions.
 """
 
 from __future__ import annotations
@@ -136,12 +136,16 @@ def forward_step(
     return step, δe, δw, RayDerivative(δo, δd, δpdf), δmore
 
 
-def backward_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> RayDerivative:
-    """Back-propagate a function of a ray into the parameters; return the adjoint of the ray, zero if not finite."""
+def backward_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> tuple[RayDerivative, mi.Bool]:
+    """Back-propagate a function of a ray into the parameters; return the adjoint of the ray and a mask.
+
+    The mask contains the lanes in which the adjoint was not finite and was set to zero.
+    """
     with dr.resume_grad():
         ray = _attached_ray(ray)
         backward(f(ray))
-        return RayDerivative(dr.grad(ray.o), dr.grad(ray.d), mi.Float(0)).finite_part()[0]
+        q, finite = RayDerivative(dr.grad(ray.o), dr.grad(ray.d), mi.Float(0)).finite_part()
+        return q, ~finite
 
 
 def forward_ray(ray: mi.Ray3f, tangent: RayDerivative, f: Callable[[mi.Ray3f], mi.Spectrum]) -> mi.Spectrum:

@@ -113,7 +113,8 @@ class Edges:
 def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spectrum, lost: NonFiniteCounter) -> None:
     """Back-propagate W·`Edges.motion` into the parameters; ``W`` is the adjoint of radiance at the film positions."""
     path = edges.path
-    q = backward_ray(path.ray, lambda ray: dr.sum(W * edges.motion(ray)))
+    q, dropped = backward_ray(path.ray, lambda ray: dr.sum(W * edges.motion(ray)))
+    lost.add(dropped)
     q = ray_to_camera(trace, film, path, q, lost)
     with dr.resume_grad():
         ray, _ = film.ray(path.s, path.key)
@@ -125,10 +126,10 @@ def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spe
 
 
 @dr.syntax
-def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges) -> mi.Spectrum:
+def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges, lost: NonFiniteCounter) -> mi.Spectrum:
     """Return what the edges contribute to the tangent of the radiance at the film positions.
 
-    The parameters must carry tangents.
+    The parameters must carry tangents. ``lost`` counts the tangents that were not finite and were dropped.
     """
     path = edges.path
     with dr.resume_grad():
@@ -137,9 +138,10 @@ def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges) -> mi.Spec
     δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))
     layout, records, k, ray0 = path.layout, path.records, path.k, dr.detach(ray)
     i = mi.UInt32(0)
-    while dr.hint(i < k, exclude=[trace, layout, ray0], label="pathreplay: towards an edge"):
+    while dr.hint(i < k, exclude=[trace, layout, ray0, lost], label="pathreplay: towards an edge"):
         v = read_back(layout, records, i, k, ray0)
-        δ = forward_step(trace, v, True, δ, mi.Bool(True))[3].finite_part()[0]
+        δ, finite = forward_step(trace, v, True, δ, mi.Bool(True))[3].finite_part()
+        lost.add(~finite)
         i += 1
     return forward_ray(path.ray, δ, edges.motion)
 

@@ -58,12 +58,14 @@ class Boundary(Term):
         if not self.move(view, trace):
             return TermResult()
         places = FilmPlaces.of(view)
-        image = None
+        image, lost, paths = None, NonFiniteCounter(), 0
         for edges in self._searches(view, trace, places):
-            δL = edges_forward(trace, places, edges)
+            δL = edges_forward(trace, places, edges, lost)
             part = places.image(edges.path.s, δL, edges.path.ray.wavelengths)
             image = part if image is None else image + part
-        return TermResult(image)
+            paths += dr.width(edges.path.s)
+        dr.eval(image)
+        return TermResult(image, lost=lost.count, paths=paths, moves=True)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         if not self.move(view, trace):

@@ -58,13 +58,15 @@ class ParticleBoundary(Term):
         return link.to_sensor.moves() or edges_move(link, start, PathState.begin(link, start).at)
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        work = self.particles.work(view, trace)
+        work, lost = self.particles.work(view, trace), NonFiniteCounter()
         assert work is not None
         link, particles, film = work
+        paths = 0
         sums = dr.zeros(mi.Float, 4 * film.pixels)
         for search, edges in self._searches(view, link, particles):
             (crossing,), key = edges.crossings, edges.path.key
-            δ = edges_forward(search.along, search.film, edges)
+            δ = edges_forward(search.along, search.film, edges, lost)
+            paths += dr.width(edges.path.s)
             if isinstance(search, EmissionSearch):
                 assert isinstance(crossing, FilmCrossing)
                 sides, shadow = crossing.sides, crossing.sides.shadow
@@ -77,7 +79,9 @@ class ParticleBoundary(Term):
                 shadow = crossing.shadow
             at = film.footprint(shadow.lit.uv)
             film.add(sums, at, at.x, at.y, colour(δ, edges.path.ray.wavelengths), shadow.exists)
-        return TermResult(film.develop(sums * (film.scale(1) / CELLS**2)))
+        image = film.develop(sums * (film.scale(1) / CELLS**2))
+        dr.eval(image)
+        return TermResult(image, lost=lost.count, paths=paths, moves=True)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         work, lost = self.particles.work(view, trace), NonFiniteCounter()
