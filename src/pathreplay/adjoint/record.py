@@ -50,6 +50,11 @@ def deepest(trace: TraceConfig, device: Device | None = None) -> int:
     return min(MAX_DEPTH_MEDIA, max((device.most_records(largest_record(trace), 2**30) - 8) // 3, 0))
 
 
+def recordable(trace: TraceConfig) -> TraceConfig:
+    """Return the configuration with a ``max_depth`` of at most `deepest`."""
+    return replace(trace, max_depth=min(trace.max_depth, deepest(trace)))
+
+
 def largest_record(trace: TraceConfig) -> int:
     """Return the bytes per vertex of the larger layout: static paths and moving paths have different layouts."""
     return max(_bytes(Layout.of(trace, moves)) for moves in (False, True))

@@ -145,10 +145,16 @@ class Resampled:
         total = dr.gather(mi.Float64, cdf, n - 1)
         lane = dr.arange(mi.UInt32, lanes)
         x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, lane, ROUNDS))) * (total / lanes)
-        index = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, cdf, i) <= x)
-        index = mi.UInt32(dr.minimum(index, n - 1))  # binary_search returns a Python integer if n is 1
+        index = _index_at(cdf, x)
         importance = dr.gather(mi.Float, mass, index)
         return Resampled(index, dr.select(importance > 0, mi.Float(total / lanes) / importance, 0))
+
+
+def _index_at(cdf: mi.Float64, x: mi.Float64 | mi.Float) -> mi.UInt32:
+    """Return the index of the first entry of ``cdf`` above ``x``, or the last index."""
+    last = dr.width(cdf) - 1
+    i = dr.binary_search(0, last, lambda i: dr.gather(mi.Float64, cdf, i) <= x)
+    return mi.UInt32(dr.minimum(i, last))  # `binary_search` returns a Python integer if there is one entry
 
 
 def pilot_size(n: int, size: mi.ScalarVector2f) -> int:
@@ -209,8 +215,7 @@ class SegmentDensity:
         n = self.width * self.height
         if self.cdf is None:
             return mi.Point2f(x, y) * mi.Point2f(self.width, self.height) - self.margin, mi.Float(1 / n)
-        below = lambda i: dr.gather(mi.Float64, self.cdf, i) <= x  # noqa: E731
-        i = mi.UInt32(dr.minimum(dr.binary_search(0, n - 1, below), n - 1))  # converts a Python integer, if n is 1
+        i = _index_at(self.cdf, x)
         probability = self._probability(i)
         rest = mi.Float(dr.gather(mi.Float64, self.cdf, i) - x)
         offset = mi.Point2f(dr.clip(1 - rest / probability, 0, dr.one_minus_epsilon(mi.Float)), y)

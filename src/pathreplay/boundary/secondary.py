@@ -21,7 +21,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
+from pathreplay.adjoint.record import Layout, record_type, recordable, room_for
 from pathreplay.boundary.cast_shadows import cast_shadows, casters
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
 from pathreplay.boundary.emitters import EmitterSegment
@@ -35,8 +35,8 @@ from pathreplay.transport.scatter import may_keep_directions
 from pathreplay.transport.vertex import TraceConfig
 
 UNGUIDED = 0.8
-"""Fraction of pilot segments that are not concentrated at cast shadows, because shadows seen in reflections and
-refractions lie at other film positions."""
+"""Fraction of the paths whose density the search for cast shadows, and then the pilot pass, leaves as it was. Shadows
+seen in reflections and refractions lie at other film positions."""
 ARCS = 8
 """Number of arcs around a vertex with a narrow lobe. Other vertices have one arc: more arcs would take time, and would
 hardly reduce the noise."""
@@ -85,7 +85,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
 
     @staticmethod
     def of(trace: TraceConfig, film: FilmDomain, lengths: tuple[float, float]) -> SecondarySearch:
-        trace = replace(trace, max_depth=min(trace.max_depth, deepest(trace)))
+        trace = recordable(trace)
         density = SegmentDensity.uniform(film.size, 0.0)
         return SecondarySearch(trace, film, density, lengths, dr.ones(mi.Float, VERTICES))
 

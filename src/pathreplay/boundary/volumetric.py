@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import derivative_by_place, derivative_by_ray
-from pathreplay.adjoint.record import Layout, deepest, record, record_type, room_for
+from pathreplay.adjoint.record import Layout, record, record_type, recordable, room_for
 from pathreplay.boundary.arcs import Arc
 from pathreplay.boundary.crofton import VisibilityProbe, bisect, crossing_weight, detect, heading, probe_positions
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
@@ -43,7 +43,7 @@ from pathreplay.transport.step import choose_step
 from pathreplay.transport.surface import met
 from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexSamples
 from pathreplay.transport.volume.media import interaction
-from pathreplay.transport.volume.passage import STEP, is_boundary, skip_null, transmittance_up_to
+from pathreplay.transport.volume.passage import is_boundary, past, skip_null, transmittance_up_to
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -83,7 +83,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
 
     @classmethod
     def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> Self:
-        return super().of(replace(trace, max_depth=min(trace.max_depth, deepest(trace))), film, length)
+        return super().of(recordable(trace), film, length)
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> BeamSegment:
         key = key_of(i, Stream.VOLUMETRIC_KEYS.of(seed))
@@ -350,9 +350,7 @@ def _observer_at(
     passing = active & (here.t < τ) & is_boundary(trace, here, ray, active)
     while dr.hint(passing, exclude=[x, trace, ray, τ], label="pathreplay: to a point of a medium"):
         entry, before = mi.PreliminaryIntersection3f(here), mi.Float(gone)
-        gone += here.t
-        gone += STEP * (1 + dr.max(dr.abs(ray.o)) + gone)
-        onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
+        onward, gone = past(ray, gone + here.t)
         here = meet(trace, onward, passing)
         passing &= (gone + here.t < τ) & is_boundary(trace, here, onward, passing)
     active = active & (medium != None) & (gone < τ)  # noqa: E711 (an array of pointers)
@@ -372,8 +370,7 @@ class ScatteredBeamSearch(EdgeSearch[CameraPath]):
 
     @staticmethod
     def of(trace: TraceConfig, film: FilmDomain, length: float) -> ScatteredBeamSearch:
-        trace = replace(trace, max_depth=min(trace.max_depth, deepest(trace)))
-        return ScatteredBeamSearch(trace, film, SegmentDensity.uniform(film.size, 0.0), length)
+        return ScatteredBeamSearch(recordable(trace), film, SegmentDensity.uniform(film.size, 0.0), length)
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
         s, density = self.density.draw(*quasi_random(i, n, Stream.SCATTERED_CENTRES.of(seed)))

@@ -40,9 +40,7 @@ def first_behind(
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
     passing = active & passes(here, ray, active)
     while dr.hint(passing, exclude=[trace, ray, passes], label="pathreplay: beyond surfaces"):
-        # The new origin stays on the ray. `spawn_ray` would move the origin sideways.
-        gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
-        onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
+        onward, gone = past(ray, t)
         here = meet(trace, onward, passing)
         t = gone + here.t
         passing &= passes(here, onward, passing)
@@ -145,3 +143,12 @@ def further(ray: mi.Ray3f, t: mi.Float) -> mi.Ray3f:
     rest = mi.Ray3f(ray)
     rest.o, rest.maxt = ray.o + t * ray.d, ray.maxt - t
     return rest
+
+
+def past(ray: mi.Ray3f, t: mi.Float) -> tuple[mi.Ray3f, mi.Float]:
+    """Return the rest of a ray behind the surface at distance ``t``, and the distance at which the rest begins.
+
+    The new origin stays on the ray. `spawn_ray` would move the origin sideways.
+    """
+    gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
+    return further(ray, gone), gone
