@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import drjit as dr
@@ -13,6 +14,8 @@ from pathreplay.inverse.images.io import Image
 
 SAMPLES = 256
 """Samples per pixel. The only source of noise is the variation of the environment within a pixel."""
+_MOST = 2**31
+"""Largest number of samples of an image. Dr.Jit counts up to 2^32 in one kernel; a film may also sample its border."""
 
 
 def background(scene: mi.Scene, sensor: int) -> Image:
@@ -24,7 +27,7 @@ def background(scene: mi.Scene, sensor: int) -> Image:
 
     Returns:
         The image on the film of the sensor, shape (height, width, channels). It is black if the scene has no
-        environment emitter.
+        environment emitter. Films of more than 8 megapixels get fewer than `SAMPLES` samples per pixel.
     """
 
     class Sky(mi.SamplingIntegrator):  # defined here, because the base class depends on the variant
@@ -42,8 +45,11 @@ def background(scene: mi.Scene, sensor: int) -> Image:
             light = mi.Spectrum(0) if environment is None else environment.eval(si, active)
             return light, mi.Bool(True), []
 
+    pixels, spp = math.prod(int(n) for n in scene.sensors()[sensor].film().crop_size()), SAMPLES
+    while spp > 1 and pixels * spp > _MOST:
+        spp //= 4  # every sampler accepts powers of four
     with dr.suspend_grad():
-        image = mi.render(scene, sensor=sensor, integrator=Sky(mi.Properties()), spp=SAMPLES, seed=0)
+        image = mi.render(scene, sensor=sensor, integrator=Sky(mi.Properties()), spp=spp, seed=0)
     return np.array(image, dtype=np.float32)
 
 
