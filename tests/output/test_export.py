@@ -212,6 +212,13 @@ def test_a_file_with_the_name_of_a_written_mesh_is_copied(many: Path, tmp_path: 
     same_pictures(found, tmp_path / "out")
 
 
+def test_flipped_texture_coordinates_are_flipped_once(many: Path, tmp_path: Path) -> None:
+    flip = '<boolean name="flip_tex_coords" value="true"/><boolean name="face_normals" value="true"/>'
+    many.write_text(MANY.replace('<boolean name="face_normals" value="true"/>', flip))
+    moved = get_array(mi.traverse(mi.load_file(str(many), optimize=False))["wedge.vertex_positions"]) * 1.3
+    same_pictures(exported(Source(many, {}, {}, {}), {"wedge.vertex_positions": moved}), tmp_path / "out")
+
+
 def test_what_nobody_knows_the_making_of_is_told(tmp_path: Path) -> None:
     scene = mi.cornell_box()
     scene["floor"]["bsdf"] = mi.load_dict({"type": "roughplastic"})

@@ -104,7 +104,7 @@ class Placing:
         return vol_bounds(stream.raw_buffer())
 
     def _mesh(self, mesh: mi.Mesh, node: Node) -> None:
-        _remove(node.props, *_MADE_BY, "to_world")
+        _remove(node.props, *_MADE_BY, "to_world", "flip_tex_coords")
         node.props.set_plugin_name("ply")
         node.props["filename"] = self._ply(mesh, node.props.id())
         self.owners.add(id(node))
