@@ -219,6 +219,12 @@ def test_flipped_texture_coordinates_are_flipped_once(many: Path, tmp_path: Path
     same_pictures(exported(Source(many, {}, {}, {}), {"wedge.vertex_positions": moved}), tmp_path / "out")
 
 
+def test_a_position_replaces_the_transform_of_a_point_light(many: Path, tmp_path: Path) -> None:
+    place = '<transform name="to_world"><translate x="2" y="3" z="2"/></transform>'
+    many.write_text(MANY.replace('<point name="position" value="2,3,2"/>', place))
+    same_pictures(exported(Source(many, {}, {}, {}), {"lamp.position": np.float32([1, 3, 2])}), tmp_path / "out")
+
+
 def test_what_nobody_knows_the_making_of_is_told(tmp_path: Path) -> None:
     scene = mi.cornell_box()
     scene["floor"]["bsdf"] = mi.load_dict({"type": "roughplastic"})

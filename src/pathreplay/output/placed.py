@@ -23,7 +23,6 @@ _MADE_BY = ("filename", "bitmap", "grid", "data", "shape_index")
 _ALSO_PLACES = {
     "sphere": ("center", "radius"),
     "cylinder": ("p0", "p1", "radius"),
-    "point": ("position",),
     "directional": ("direction",),
 }
 """Properties by plugin whose effect `mi.traverse` includes in `to_world`. An exported `to_world` replaces them."""
@@ -177,6 +176,8 @@ class Placing:
         elif value.size == 1 and "." not in place:
             node.props[place] = float(value.ravel()[0])
         elif value.size == 3 and "." not in place:
+            if plugin == "point" and place == "position":
+                _remove(node.props, "to_world")
             node.props[place] = mi.ScalarVector3d(*(float(x) for x in value.ravel()))
         else:
             raise PathreplayError(
