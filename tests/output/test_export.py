@@ -225,6 +225,14 @@ def test_a_position_replaces_the_transform_of_a_point_light(many: Path, tmp_path
     same_pictures(exported(Source(many, {}, {}, {}), {"lamp.position": np.float32([1, 3, 2])}), tmp_path / "out")
 
 
+def test_a_direction_of_the_sun_of_another_length_comes_out(tmp_path: Path) -> None:
+    scene = BUILTINS["flat-colours"](resolution=4) | {"sky": {"type": "sunsky", "sun_direction": [0.0, 1.0, 1.0]}}
+    found = exported(Source(scene, {}, {}, {}), {"sky.sun_direction": np.float32([0.1, 0.9, 0.8])})
+    (tmp_path / "out").mkdir()
+    write_files(found, tmp_path / "out")
+    require_same(found.scene, tmp_path / "out")
+
+
 def test_what_nobody_knows_the_making_of_is_told(tmp_path: Path) -> None:
     scene = mi.cornell_box()
     scene["floor"]["bsdf"] = mi.load_dict({"type": "roughplastic"})

@@ -176,6 +176,8 @@ def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
         form = form_of(params, key)
         seen = form.see(params[key])
         array = np.ascontiguousarray(value, np.float32)
+        if key.endswith(".sun_direction"):  # `sunsky` normalizes it when it is loaded
+            array = array / np.linalg.norm(array)
         params[key] = form.store(type(seen)(array) if dr.is_tensor_v(seen) else to_value(seen, array))
     params.update()
     return traversed(scene)
