@@ -233,6 +233,17 @@ def test_a_direction_of_the_sun_of_another_length_comes_out(tmp_path: Path) -> N
     require_same(found.scene, tmp_path / "out")
 
 
+def test_names_of_copied_files_are_unique(tmp_path: Path) -> None:
+    mesh = mi.load_dict({"type": "cube"})
+    places = "a/box-2.ply", "b/box.ply", "c/box.ply"
+    for place in places:
+        (tmp_path / place).parent.mkdir()
+        mesh.write_ply(str(tmp_path / place))
+    scene = {place[0]: {"type": "ply", "filename": str(tmp_path / place)} for place in places}
+    found = exported(Source({"type": "scene", **scene}, {}, {}, {}), {})
+    assert sorted(path.parent.name for path in found.copies.values()) == list("abc")
+
+
 def test_what_nobody_knows_the_making_of_is_told(tmp_path: Path) -> None:
     scene = mi.cornell_box()
     scene["floor"]["bsdf"] = mi.load_dict({"type": "roughplastic"})

@@ -224,9 +224,10 @@ def copied_files(described: Described, placed: Collection[int]) -> dict[str, Pat
         path = described.find_file(name).resolve()
         new_name = next((new for new, old in copies.items() if old == path), None)
         if new_name is None:
-            new_name = f"files/{path.name}"
-            if new_name in copies:
-                new_name = f"files/{path.stem}-{len(copies)}{path.suffix}"
+            new_name, number = f"files/{path.name}", 0
+            while new_name in copies:
+                number += 1
+                new_name = f"files/{path.stem}-{number}{path.suffix}"
             copies[new_name] = path
         node.props["filename"] = new_name
     return copies
