@@ -113,6 +113,15 @@ def test_shards_of_a_fixed_number_of_samples_are_not_those_of_an_adaptive_one() 
         make_config({**job, "target": {"values": {"red.reflectance.value": 0.5}}, "spp": 8, "spp_shards": 8})
 
 
+def test_a_stage_with_its_own_samples_is_not_split_into_the_halves_of_adaptive_ones() -> None:
+    job = {"scene": "cornell-box", "parameters": [{"key": "red.reflectance.value"}], "spp": "auto"}
+    job |= {"target": {"values": {"red.reflectance.value": 0.5}}, "stages": [{"iterations": 1, "spp": 2}]}
+    make_config({**job, "spp_shards": 2})
+    make_config({**job, "loss": "log", "debias": True})
+    with pytest.raises(PathreplayError, match="multiple of 4"):
+        make_config({**job, "spp_shards": 2, "measure_snr": True})
+
+
 @pytest.mark.slow
 def test_table(target: np.ndarray) -> None:
     for loss in SMOOTH:

@@ -153,6 +153,15 @@ class Config(Table):
         """Number of shards per view and iteration: `spp_shards`, or twice `spp_shards` if the noise is measured."""
         return self.spp_shards * (2 if self.halves_samples else 1)
 
+    def _split_samples(self) -> list[tuple[int, int]]:
+        """Return the smallest `spp` of the job and the `spp` of its stages, each with its number of shards.
+
+        The samples of a stage with its own `spp` are not split into the halves of spp = "auto".
+        """
+        first = self.spp if isinstance(self.spp, int) else self.adaptive_spp.min
+        fixed = self.spp_shards * (2 if self.measure_snr else 1)
+        return [(first, self.parts), *((s.spp, fixed) for s in self.stages or [] if s.spp is not None)]
+
     def completed_entry(self, entry: Parameter) -> Parameter:
         """Return a copy of a parameter's table in which missing ``learning_rate`` and ``refine_at`` are filled in."""
         refine_at = entry.refine_at or []
@@ -198,12 +207,12 @@ class Config(Table):
                 raise ValueError(
                     f"measure_snr splits the samples into two halves, but a stage has spp = {stage.spp}; make it even"
                 )
-        for spp in (self.adaptive_spp.min if self.spp == AUTO else self.spp, *(s.spp for s in self.stages or [])):
-            if spp is not None and self.spp_shards > 1 and spp % self.parts:
-                halves = ", each in two halves" if self.halves_samples else ""
+        for spp, parts in self._split_samples():
+            if self.spp_shards > 1 and spp % parts:
+                halves = ", each in two halves" if parts > self.spp_shards else ""
                 raise ValueError(
                     f"spp = {spp} cannot be split into spp_shards = {self.spp_shards} equal shards{halves}; set spp to "
-                    f"a multiple of {self.parts}"
+                    f"a multiple of {parts}"
                 )
         return self
 
@@ -296,12 +305,11 @@ class Config(Table):
                 f"debias: loss = '{self.loss}' is not smooth where image and target are equal, so that extrapolation "
                 "does not remove its bias; remove 'debias', or use a smooth loss such as 'log'"
             )
-        first = self.adaptive_spp.min if self.spp == AUTO else self.spp
-        numbers = [first, *(stage.spp for stage in self.stages or [])]
-        if any(isinstance(spp, int) and spp < 2 * self.parts for spp in numbers):
-            raise ValueError(
-                f"debias: the loss is evaluated at two halves of the samples; set spp to {2 * self.parts} or more"
-            )
+        for spp, parts in self._split_samples():
+            if spp < 2 * parts:
+                raise ValueError(
+                    f"debias: the loss is evaluated at two halves of the samples; set spp to {2 * parts} or more"
+                )
         return self
 
     @model_validator(mode="after")
