@@ -46,13 +46,23 @@ try:
 except PathreplayError as error:
     print(error)
 print(mi.variant())
+
+def sets_and_fails():
+    mi.set_variant("scalar_rgb")
+    raise ValueError("no")
+try:
+    Imported("Loss", "own:f", sets_and_fails)(float)
+except PathreplayError as error:
+    print(error)
+print(mi.variant())
 """
 SETS = "Loss 'own:f' sets the variant 'scalar_rgb', but the job runs in 'llvm_ad_rgb'; do not set a variant there"
+FAILS = "Loss 'own:f' cannot be computed (no); fix it, or name another"
 
 
 def test_what_is_no_number_is_refused_by_its_type(run_python: Callable[..., Any]) -> None:
     ended = run_python(HOSTILE)
-    assert ended.stdout.splitlines() == [SETS, "llvm_ad_rgb"], ended.stdout + ended.stderr
+    assert ended.stdout.splitlines() == [SETS, "llvm_ad_rgb", FAILS, "llvm_ad_rgb"], ended.stdout + ended.stderr
 
 
 NUMBERS = {

@@ -185,12 +185,15 @@ def _execute(name: str, path: Path) -> None:
 def _same_variant(who: str) -> Iterator[None]:
     """If the code in the context changes Mitsuba's variant, restore the variant and raise PathreplayError.
 
-    The message begins with ``who``.
+    If the code raises an error, its error is kept. The message begins with ``who``.
     """
     before = mi.variant()
-    yield
-    if (after := mi.variant()) != before:
-        mi.set_variant(before)
+    try:
+        yield
+    finally:
+        if (after := mi.variant()) != before:
+            mi.set_variant(before)
+    if after != before:
         raise PathreplayError(
             f"{who} sets the variant '{after}', but the job runs in '{before}'; do not set a variant there"
         )
