@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import mitsuba as mi
@@ -10,7 +11,7 @@ import pytest
 
 from pathreplay.errors import PathreplayError
 from pathreplay.jobs import make_config
-from pathreplay.output.surface_scene import _placed, emitting_mesh, surface_xml
+from pathreplay.output.surface_scene import _cameras, _placed, emitting_mesh, surface_xml
 from pathreplay.output.surfaces import surface
 from pathreplay.runs.run_folder import Job
 
@@ -52,6 +53,22 @@ def test_a_scene_with_two_media_is_told(tmp_path: Path) -> None:
     (tmp_path / "room.xml").write_text(f'<scene version="3.0.0">{2 * shape}</scene>')
     with pytest.raises(PathreplayError, match=r"has 2 shapes .* of exactly one; .* with: pathreplay export 'a run'"):
         _placed(Path("a run"), Job(make_config(job), None, tmp_path))
+
+
+def test_cameras_have_the_poses_that_the_run_recovered(tmp_path: Path) -> None:
+    frames = [
+        {"file_path": f"{name}.png", "transform_matrix": np.eye(4).tolist(), "w": 8, "h": 8, "fl_x": 9.0}
+        for name in ("left", "right")
+    ]
+    for frame in frames:
+        mi.Bitmap(np.zeros((8, 8, 3), np.uint8)).write(str(tmp_path / str(frame["file_path"])))
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}))
+    table = {"scene": "room.xml", "parameters": [{"key": "a"}], "capture": {"transforms": "transforms.json"}}
+    job = Job(make_config(table), None, tmp_path)
+    moved = np.float32([[0, 0, 1, 3], [0, 1, 0, 2], [-1, 0, 0, 1], [0, 0, 0, 1]])
+    before, after = (_cameras(job, values) for values in ({}, {"right.to_world": moved}))
+    np.testing.assert_array_equal(after[1]["to_world"].matrix, moved)
+    np.testing.assert_array_equal(after[0]["to_world"].matrix, before[0]["to_world"].matrix)
 
 
 def test_mitsuba_renders_the_radiance(tmp_path: Path) -> None:

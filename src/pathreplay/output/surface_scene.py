@@ -13,6 +13,7 @@ import scipy.ndimage
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.capture import read_capture
 from pathreplay.inverse.images.io import encoded, exr_bytes, picture_size, read_image, with_channels
+from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.output.export import run_result
 from pathreplay.output.surfaces import surface
 from pathreplay.platform import backend, compat
@@ -63,7 +64,7 @@ def export_surface(run: Path, output: Path | None = None) -> str:
     if density is None or radiance is None:
         raise PathreplayError(f"Run {run} recovered no density grid with a radiance; use pathreplay export")
     low, size = _placed(run, job)
-    cameras = _cameras(job)
+    cameras = _cameras(job, values)
     views = _compared(run, cameras)
     tried = THICKNESSES if views else THICKNESSES[:1]
     meshes = (emitting_mesh(density[..., 0], radiance, low, size, thickness) for thickness in tried)
@@ -167,10 +168,14 @@ def _at(values: np.ndarray, points: np.ndarray) -> np.ndarray:
     return scipy.ndimage.map_coordinates(values.astype(np.float64), points[:, ::-1].T, order=1, mode="nearest")
 
 
-def _cameras(job: Job) -> list[SceneDict]:
+def _cameras(job: Job, values: Arrays) -> list[SceneDict]:
+    """Return the cameras of the capture, with the poses that the run has recovered."""
     if job.config.capture is None:
         return []
-    return [shot.camera for shot in read_capture(job.config.capture, job.base, picture_size).values()]
+    shots = read_capture(job.config.capture, job.base, picture_size)
+    poses = {name: values[key] for name in shots if (key := f"{name}.to_world") in values}
+    places = {name: {"to_world": mi.ScalarTransform4f(pose.astype(np.float64))} for name, pose in poses.items()}
+    return [{**shot.camera, **places.get(name, {})} for name, shot in shots.items()]
 
 
 def surface_xml(cameras: Iterable[SceneDict], has_sky: bool) -> str:
