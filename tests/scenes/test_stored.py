@@ -20,6 +20,7 @@ from pathreplay.inverse.images.io import exr_bytes, read_image
 from pathreplay.inverse.parameters.grids import rmse
 from pathreplay.jobs import make_config, optimize
 from pathreplay.output.export import export_run
+from pathreplay.scenes.loading import load_scene_for
 from pathreplay.scenes.parameters import get_array, to_value
 from pathreplay.scenes.stored import AS_STORED, form_of
 
@@ -150,6 +151,14 @@ def test_a_sky_is_refined_by_its_own_columns(folder: Path) -> None:
     levels = [{"key": "env.data", "initial": 0.5, "lower": 0.0, "resolutions": [4, 8], "refine_at": [2]}]
     result = optimize(make_config({**JOB, "parameters": levels}), progress=False)
     assert result.parameters["env.data"].shape == (4, 8, 3)
+
+
+def test_eight_bit_images_in_memory_become_numbers() -> None:
+    paint = {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((2, 2, 3), np.uint8))}
+    ball = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": paint}}
+    scene, notes = load_scene_for({"type": "scene", "ball": ball}, ["*.data"])
+    assert isinstance(mi.traverse(scene)["ball.bsdf.reflectance.data"], mi.TensorXf)
+    assert notes == ("stored the texels of images in memory as floating-point numbers: they carry derivatives",)
 
 
 def test_eight_bit_textures_become_numbers_where_they_are_asked_for(folder: Path) -> None:

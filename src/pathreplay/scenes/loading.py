@@ -125,7 +125,8 @@ def load_scene_for(
     del scene, params
     gc.collect()
     scene, exchanged = load_scene_with(spec, plugins, base, cameras, floats, **parameters)
-    notes = [f"stored the texels of '{name}' as floating-point numbers: they carry derivatives" for name in floats]
+    names = [f"'{name}'" if name else "images in memory" for name in floats]
+    notes = [f"stored the texels of {name} as floating-point numbers: they carry derivatives" for name in names]
     if exchanged:
         count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
         notes.append(f"replaced 'dielectric' by 'dielectric_ad' ({count} of them): its eta carries a derivative")
@@ -147,7 +148,7 @@ def load_scene_with_floats(
 def coarse_pictures(params: mi.SceneParameters, wanted: Iterable[str]) -> tuple[str, ...]:
     """Return the image files of 8-bit textures whose texels match a pattern in ``wanted``.
 
-    Only patterns whose last part is ``data`` are used.
+    An empty name stands for the images in memory. Only patterns whose last part is ``data`` are used.
     """
     owners = [params.properties[key][2] for key in _matching(params, wanted, "data")]
     matches = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
