@@ -265,7 +265,7 @@ def png_bytes(image: Image, exposure: float = 1.0) -> bytes:
         shown = (image[:, :, :1] if image.shape[2] == 2 else image) * exposure
     shown = np.clip(shown, 0, 1).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
-    # Encode in memory, because only `run_folder` writes files; that module handles a full disk.
+    # Encode in memory: the callers write the file, and handle a full disk.
     stream = mi.MemoryStream()
     bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(stream, mi.Bitmap.FileFormat.PNG)
     return bytes(stream.raw_buffer())
