@@ -134,7 +134,10 @@ def _source(job: Job, values: Arrays) -> Source:
 
 
 def _integrator(job: Job) -> Json | None:
-    """Return the integrator of a job, or None to use that of the scene."""
+    """Return the integrator of a job, or None to use that of the scene.
+
+    None is returned if the integrator was an object, and for folders whose `run.json` does not name the integrator.
+    """
     options = job.config.integrator.model_dump()
     if "integrator" not in job.config.model_fields_set:
         return None
