@@ -237,8 +237,9 @@ def require_finite(params: mi.SceneParameters) -> None:
 def get_array(value: SceneValue | float) -> np.ndarray:
     """Copy the value of a floating-point parameter to a NumPy array of the same precision, without derivatives.
 
-    The result has the shape (1,) for a plain number, (n,) for ``Float``, and (4, 4) for ``AffineTransform4f``. A single
-    ``Color3f`` gives the shape (3,), and n colours give the shape (3, n). The shape of a ``TensorXf`` is kept.
+    A plain number is converted to single precision. The result has the shape (1,) for a plain number, (n,) for
+    ``Float``, and (4, 4) for ``AffineTransform4f``. A single ``Color3f`` gives the shape (3,), and n colours give the
+    shape (3, n). The shape of a ``TensorXf`` is kept.
     """
     if isinstance(value, float):
         return np.array([value], np.float32)
