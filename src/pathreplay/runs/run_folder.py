@@ -349,10 +349,10 @@ def require_writable_name(path: Path, option: str) -> None:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             os.lstat(path)
     except UnicodeEncodeError:
-        raise PathreplayError(f"Run folder {str(path)!a} is not UTF-8; give another {option}") from None
+        raise PathreplayError(f"Folder {str(path)!a} is not UTF-8; give another {option}") from None
     except (OSError, ValueError) as error:  # the path is too long or contains a null character
         name = ascii(str(path))
-        raise PathreplayError(f"Run folder {name} cannot be used ({error}); give another {option}") from None
+        raise PathreplayError(f"Folder {name} cannot be used ({error}); give another {option}") from None
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
