@@ -35,7 +35,7 @@ from pathreplay.scenes.loading import as_xml_has_them, builtin_dict, coarse_pict
 from pathreplay.scenes.parameters import get_array
 from pathreplay.types import Json
 
-_OPTION = "-o"
+OPTION = "-o"
 
 
 def export_run(run: Path, output: Path | None = None) -> str:
@@ -58,16 +58,12 @@ def export_run(run: Path, output: Path | None = None) -> str:
             written.
     """
     folder = run / "export" if output is None else output
-    require_writable_name(run, "RUN")
-    require_writable_name(folder, _OPTION)
-    job = read_job(run)
-    backend.set_variant(job.config.variant)
-    values = run_result(run, job.in_python)
+    job, values = opened_run(run, folder)
     source = _source(job, values)
     photographic = {key: values.pop(key) for key in (EXPOSURE, RESPONSE) if key in values}
     free = {entry.key: values.pop(entry.key) for entry in job.config.parameters if entry.shape is not None}
     export = exported(source, values, _integrator(job))
-    with whole_folder(folder, _OPTION) as part:
+    with whole_folder(folder, OPTION) as part:
         write_files(export, part)
         for name, data in _beside(export, values | photographic, free).items():
             (part / name).parent.mkdir(exist_ok=True)
@@ -92,6 +88,18 @@ def write_files(export: Exported, folder: Path) -> None:
             shutil.copyfile(path, folder / name)
         except OSError as error:
             raise PathreplayError(f"File {path} of the scene cannot be copied ({error.strerror})") from error
+
+
+def opened_run(run: Path, folder: Path) -> tuple[Job, dict[str, np.ndarray]]:
+    """Read the job and the result of a run, and activate the variant of the run.
+
+    Raises PathreplayError unless ``run`` is a run folder with a result, and the name of the new ``folder`` is valid.
+    """
+    require_writable_name(run, "RUN")
+    require_writable_name(folder, OPTION)
+    job = read_job(run)
+    backend.set_variant(job.config.variant)
+    return job, run_result(run, job.in_python)
 
 
 def run_result(run: Path, in_python: bool) -> dict[str, np.ndarray]:

@@ -14,12 +14,12 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.capture import read_capture
 from pathreplay.inverse.images.io import encoded, exr_bytes, picture_size, read_image, with_channels
 from pathreplay.inverse.parameters.values import Arrays
-from pathreplay.output.export import run_result
+from pathreplay.output.export import OPTION, opened_run
 from pathreplay.output.surfaces import surface
-from pathreplay.platform import backend, compat
+from pathreplay.platform import compat
 from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.platform.threads import spare_thread
-from pathreplay.runs.run_folder import Job, read_job, require_writable_name
+from pathreplay.runs.run_folder import Job
 from pathreplay.scenes.loading import load_scene
 from pathreplay.types import SceneDict
 
@@ -53,11 +53,7 @@ def export_surface(run: Path, output: Path | None = None) -> str:
         PathreplayError: the run has no such result, or no part of the grid is dense enough.
     """
     folder = run / "surface" if output is None else output
-    require_writable_name(run, "RUN")
-    require_writable_name(folder, "-o")
-    job = read_job(run)
-    backend.set_variant(job.config.variant)
-    values = run_result(run, job.in_python)
+    job, values = opened_run(run, folder)
     density, radiance = (
         next((value for key, value in values.items() if key.endswith(ending)), None) for ending in (DENSITY, RADIANCE)
     )
@@ -68,7 +64,7 @@ def export_surface(run: Path, output: Path | None = None) -> str:
     views = _compared(run, cameras)
     tried = THICKNESSES if views else THICKNESSES[:1]
     meshes = (emitting_mesh(density[..., 0], radiance, low, size, thickness) for thickness in tried)
-    with whole_folder(folder, "-o") as part:
+    with whole_folder(folder, OPTION) as part:
         if SKY in values:
             (part / "sky.exr").write_bytes(exr_bytes(values[SKY]))
         (part / "scene.xml").write_text(surface_xml([camera for camera, _ in views], SKY in values))

@@ -58,7 +58,7 @@ def joined(parts: Sequence[Problem], config: Config) -> JointProblem:
 
     Raises:
         PathreplayError: shared variables have different shapes, two problems have the same scene, or a problem has
-            exposures or a baseline.
+            exposures, a response or a baseline.
     """
     variables: dict[str, Variable] = {}
     for part in parts:
