@@ -343,7 +343,7 @@ class Evaluator:
             self._sweeps[which],
             EXPOSURE in self._moving,
             RESPONSE in self._moving,
-            problem.config.debias,
+            problem.debias,
         )
         problem.disk.rest()
         with plain_errors():

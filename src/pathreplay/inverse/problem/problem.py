@@ -117,6 +117,11 @@ class Problem:
     cache: VariableCache = field(default_factory=VariableCache)
     """Cache of converted values."""
 
+    @property
+    def debias(self) -> bool:
+        """Whether the bias of the loss due to noise is removed to first order: see `ViewLoss.debias`."""
+        return self.config.debias
+
     @contextmanager
     def computing(self) -> Iterator[None]:
         """Return a context for renderings: it turns errors of integrators into PathreplayError, and limits the memory.
