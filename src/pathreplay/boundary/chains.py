@@ -59,7 +59,8 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
     """Probe a path from the camera, or from an emitter, to its first vertex without a delta lobe.
 
     Vertices before the first surface that may move are not compared, apart from the first (`VisibilityProbe.still`).
-    In lanes with ``flows`` (see `FilmDomain`), the camera ray may move, so that all surfaces count as moving.
+    In lanes with ``flows`` (see `FilmDomain`), the camera ray may move, so that all surfaces count as moving. Hard
+    shadows that static surfaces cast onto static surfaces are not compared either.
     """
     sampler = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
@@ -75,7 +76,7 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
         if dr.hint(tests_shadows(trace), mode="scalar"):
             test = _shadow_test(trace, path.at, key, path.depth, path.active)
             dark = test.dark
-            if dr.hint(trace.to_sensor is None, mode="scalar"):
+            if dr.hint(trace.to_sensor is None, mode="scalar"):  # the sensor of light paths may move
                 dark &= moves | may_move(trace, test.hit)
             vertex_probe.signature = mixed(vertex_probe.signature, dr.select(dark, mi.UInt32(1), 0))
         slides = _slides(trace, path.at)

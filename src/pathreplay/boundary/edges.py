@@ -129,7 +129,8 @@ def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spe
 def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges, lost: NonFiniteCounter) -> mi.Spectrum:
     """Return what the edges contribute to the tangent of the radiance at the film positions.
 
-    The parameters must carry tangents. ``lost`` counts the tangents that were not finite and were dropped.
+    The parameters must carry tangents. ``lost`` counts the paths on which the tangent of a ray was not finite and was
+    dropped.
     """
     path = edges.path
     with dr.resume_grad():
@@ -137,11 +138,12 @@ def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges, lost: NonF
         δo, δd = tangents(ray.o, ray.d)
     δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))
     layout, records, k, ray0 = path.layout, path.records, path.k, dr.detach(ray)
-    i = mi.UInt32(0)
+    i, broken = mi.UInt32(0), mi.Bool(False)
     while dr.hint(i < k, exclude=[trace, layout, ray0, lost], label="pathreplay: towards an edge"):
         v = read_back(layout, records, i, k, ray0)
         δ, finite = forward_step(trace, v, True, δ, mi.Bool(True))[3].finite_part()
-        lost.add(~finite)
+        lost.add(~finite & ~broken)
+        broken |= ~finite
         i += 1
     return forward_ray(path.ray, δ, edges.motion)
 

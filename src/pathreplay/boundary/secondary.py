@@ -35,8 +35,8 @@ from pathreplay.transport.scatter import may_keep_directions
 from pathreplay.transport.vertex import TraceConfig
 
 UNGUIDED = 0.8
-"""Fraction of the paths whose density the search for cast shadows, and then the pilot pass, leaves as it was. Shadows
-seen in reflections and refractions lie at other film positions."""
+"""Fraction of the paths that keep the previous density, at each of two refinements: by cast shadows, then by the pilot
+pass. Shadows seen in reflections and refractions lie at other film positions."""
 ARCS = 8
 """Number of arcs around a vertex with a narrow lobe. Other vertices have one arc: more arcs would take time, and would
 hardly reduce the noise."""

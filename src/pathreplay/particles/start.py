@@ -158,10 +158,11 @@ class Emission:
             o, d = _from_sphere(each, ray.d, u.place)
             here = emitter == mi.EmitterPtr(each)
             ray.o, ray.d = dr.select(here, o, ray.o), dr.select(here, d, ray.d)
-        rounded = active & _is_one_of(self.rounded, emitter)
-        if trace.traits.lights_deform or self.rounded:
-            origin = _origin(trace, emitter, ray, active if trace.traits.lights_deform else rounded)
-            if trace.traits.lights_deform:
+        deform = trace.traits.lights_deform
+        if deform or self.rounded:
+            rounded = active & _is_one_of(self.rounded, emitter)
+            origin = _origin(trace, emitter, ray, active if deform else rounded)
+            if deform:
                 # Mitsuba's `sample_ray` omits the derivative of the areas of triangles, unless the radiance is
                 # textured.
                 hit, back, on_mesh = origin

@@ -104,10 +104,10 @@ def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
 
 
 def solid_angle(y: SurfacePoint, origin: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Float, mi.Float]:
-    """Return the log of the solid angle of the area element at ``y``, as seen from ``origin``, up to a constant.
+    """Compute the log of the solid angle of the area element at ``y``, as seen from ``origin``, up to a constant.
 
-    Returns a mask of the lanes in which the solid angle is not zero, the squared distance of ``y``, and the logarithm.
-    The logarithm is used because powers of the tiny distances in corners would overflow.
+    Returns the lanes in which the solid angle is not zero, the squared distance of ``y``, and the logarithm. The
+    logarithm is used because powers of the tiny distances in corners would overflow.
     """
     towards = y.p - origin
     facing = dr.abs(dr.dot(y.A, towards))

@@ -369,9 +369,11 @@ def pictures_of(
 ) -> Iterator[tuple[str, Image]]:
     """Render some views as `render_views` does, with ``spp`` samples per pixel (default: ``eval_spp``).
 
-    Yields name and image of each view. The values are set once, before the first view.
+    Yields name and image of each view. The values are set once in each scene, before the first view.
     """
-    put_values(problem, values)
+    views = list(views)
+    for home in {id(home): home for home, _ in map(problem.home, views)}.values():
+        put_values(home, values)
     places = {view.name: n for n, view in enumerate(problem.views)}
     for view in views:
         image = _plain(problem, view, problem.config.eval_spp if spp is None else spp)

@@ -150,7 +150,8 @@ class Own:
 def total_variation(values: mi.TensorXf) -> mi.TensorXf:
     """Compute the total variation Σ mean(√(Δv² + r²) - r) of a grid, where r is `ROUND`.
 
-    The sum is over the spatial axes. The mean is over the differences Δv of all neighbours along an axis.
+    The sum is over the spatial axes. The mean is over the differences Δv of all neighbours along an axis. The first and
+    the last column are not neighbours, unlike in the ``total_variation`` of an environment map.
 
     Args:
         values: a texture (height, width, channels) or a volume (depth, height, width, channels).

@@ -104,10 +104,10 @@ def _medium_along(
     active: mi.Bool,
     to_end: bool,
 ) -> mi.MediumPtr:
-    """Return the medium before the first surface on a ray that separates media, or behind the last such surface.
+    """Return the medium before the first surface on a ray that separates media.
 
-    The search goes ``to_end`` for the last surface. The result is ``otherwise`` if there is no such surface. ``hit`` is
-    the first hit of the ray.
+    With ``to_end``, return the medium behind the last such surface. The result is ``otherwise`` if there is no such
+    surface. ``hit`` is the first hit of the ray.
     """
     medium = mi.MediumPtr(otherwise)
     if dr.hint(trace.media.bounded, mode="scalar"):
