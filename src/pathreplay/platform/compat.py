@@ -103,19 +103,20 @@ def triangle_corners(
     return a, b, c
 
 
-def triangle_sides(
+def triangle_point(
     hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
-) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Return two sides of the triangle that was hit: the vectors from its first corner to the other two corners.
+) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
+    """Return the interaction with the triangle that was hit, at fixed surface coordinates, and the area vector.
 
-    The sides carry the same derivatives as the corners (see `triangle_corners`), except in instances: there, Mitsuba
-    3.9 returns sides in the coordinates of the mesh.
+    The area vector is the cross product of two sides of the triangle. The sides carry the same derivatives as the
+    corners (see `triangle_corners`), except in instances: there, Mitsuba 3.9 returns sides in the coordinates of the
+    mesh.
     """
+    si = hit.compute_surface_interaction(ray, minimal() | follow_shape(), active)
     if _SHADING in mi.RayFlags.__members__:
         a, b, c = triangle_corners(hit, ray, active)
-        return b - a, c - a
-    si = hit.compute_surface_interaction(ray, minimal() | follow_shape(), active)
-    return si.dp_du, si.dp_dv  # both are sides of the triangle, because the flags request no texture coordinates
+        return si, dr.cross(b - a, c - a)
+    return si, dr.cross(si.dp_du, si.dp_dv)  # both are sides, because the flags request no texture coordinates
 
 
 class MeshArrays(NamedTuple):

@@ -151,21 +151,21 @@ def _at_surface(
     if trace.resamples:
         sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
         if ctx.mode == mi.TransportMode.Importance:
-            w_sample = _adjoint_weight(v, sample, w_sample, active)
+            w_sample = _adjoint_weight(v, sample, w_sample, active if trace.follows else active & kept.delta)
         if attached:
             free = _followed(trace, v, u, ctx, smooth)
             follows = free | (active & kept.delta)
             d = dr.select(follows, dr.replace_grad(kept.d, si.to_world(sample.wo)), d)
             J = dr.select(follows, 1, J)
 
-    wo = si.to_local(d)
-    if attached:
+    wo, pdf = si.to_local(d), kept.pdf
+    if ctx.mode == mi.TransportMode.Importance:
+        f = smooth_adjoint(v, wo, smooth)  # light paths have no MIS weight, for which the density would be needed
+    elif attached:
         f, pdf = bsdf.eval_pdf(ctx, si, wo, smooth)
         pdf = dr.replace_grad(kept.pdf, dr.select(smooth, pdf, 0))
     else:
-        f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
-    if ctx.mode == mi.TransportMode.Importance:
-        f = smooth_adjoint(v, wo, smooth)
+        f = bsdf.eval(ctx, si, wo, smooth)
     w = f * J * dr.detach(reciprocal(kept.pdf))
     # The weight of a failed sample is zero even if f is not zero: `roughdielectric` may sample a reflected direction on
     # the wrong side of the surface. If the BSDF is black, both f and the weight are zero, and w keeps its derivative.

@@ -98,9 +98,10 @@ def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
     degenerate, and change if the texture coordinates move.
     """
     on_mesh = active & hit.shape.is_mesh()
-    y = hit.compute_surface_interaction(ray, compat.normal_partials() | compat.follow_shape(), active)
-    A = dr.select(on_mesh, dr.cross(*compat.triangle_sides(hit, ray, on_mesh)), dr.cross(y.dp_du, y.dp_dv))
-    return SurfacePoint(y.p, A, dr.detach(y.n), dr.select(on_mesh, 0, _curvature(dr.detach(y))))
+    flat, A = compat.triangle_point(hit, ray, on_mesh)
+    y = hit.compute_surface_interaction(ray, compat.normal_partials() | compat.follow_shape(), active & ~on_mesh)
+    round_ = SurfacePoint(y.p, dr.cross(y.dp_du, y.dp_dv), dr.detach(y.n), _curvature(dr.detach(y)))
+    return dr.select(on_mesh, SurfacePoint(flat.p, A, dr.detach(flat.n), mi.Float(0)), round_)
 
 
 def solid_angle(y: SurfacePoint, origin: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Float, mi.Float]:
