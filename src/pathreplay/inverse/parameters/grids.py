@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache
 
 import numpy as np
-import scipy.ndimage
+import scipy.sparse
 from numpy.typing import NDArray
 
 from pathreplay.inverse.images.io import Image
@@ -55,12 +55,33 @@ def resampled(grid: Array, shape: Sequence[int], wraps: bool = False) -> Array:
     changes the texture. The result stays within the range of the values. Downsampling by more than a factor of two
     skips entries.
     """
-    factors = [new / old for new, old in zip((*shape[:-1], grid.shape[-1]), grid.shape, strict=True)]
-    zoom = partial(scipy.ndimage.zoom, output=np.float32, order=1, grid_mode=True)
-    if wraps:
-        along_x = [factor if axis == grid.ndim - 2 else 1.0 for axis, factor in enumerate(factors)]
-        grid, factors[-2] = zoom(grid, along_x, mode="grid-wrap"), 1.0
-    return zoom(grid, factors, mode="nearest")
+    return np.clip(interpolated(grid, shape, wraps), grid.min(), grid.max())
+
+
+def interpolated(grid: Array, shape: Sequence[int], wraps: bool, transposed: bool = False) -> Array:
+    """Return `resampled` values up to rounding errors, which may leave the range of the values.
+
+    With ``transposed``, the transpose of the interpolation from ``shape`` to the shape of the grid is applied.
+    """
+    for axis, n in enumerate(shape[:-1]):
+        m, periodic = grid.shape[axis], wraps and axis == len(shape) - 2
+        matrix = _interpolation(n, m, periodic).T if transposed else _interpolation(m, n, periodic)
+        columns = np.moveaxis(grid, axis, 0)
+        rows = matrix @ columns.reshape(m, -1)
+        grid = np.moveaxis(rows.reshape(n, *columns.shape[1:]), 0, axis)
+    return np.ascontiguousarray(grid, np.float32)
+
+
+@cache
+def _interpolation(m: int, n: int, wraps: bool) -> scipy.sparse.csr_array:
+    """Return the n x m matrix of linear interpolation from the centres of m cells to the centres of n cells."""
+    x = (np.arange(n) + 0.5) * (m / n) - 0.5
+    left = np.floor(x).astype(int)
+    weight = (x - left).astype(np.float32)
+    columns = np.stack([left, left + 1])
+    columns = columns % m if wraps else np.clip(columns, 0, m - 1)
+    weights = np.stack([1 - weight, weight])
+    return scipy.sparse.csr_array((weights.ravel(), (np.tile(np.arange(n), 2), columns.ravel())), shape=(n, m))
 
 
 def comparable(shape: Sequence[int], other: Sequence[int]) -> bool:

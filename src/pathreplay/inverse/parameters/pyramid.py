@@ -17,12 +17,11 @@ step.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from math import prod
 
 import numpy as np
-import scipy.sparse
 
+from pathreplay.inverse.parameters.grids import interpolated
 from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
 from pathreplay.inverse.parameters.values import Array
 
@@ -56,7 +55,7 @@ class Pyramid(Coordinates):
         level = by_values if self.inner is None else self.inner.gradient(values, by_values)
         parts = [level.ravel()]
         for coarse in reversed(_levels(values.shape)[:-1]):
-            level = self._resize(level, coarse, transposed=True)
+            level = interpolated(level, coarse, self._wraps, transposed=True)
             parts.append(level.ravel())
         return np.concatenate(parts[::-1])
 
@@ -66,20 +65,8 @@ class Pyramid(Coordinates):
         level = latent[:end].reshape(first)
         for shape in finer:
             begin, end = end, end + prod(shape)
-            level = self._resize(level, shape) + latent[begin:end].reshape(shape)
+            level = interpolated(level, shape, self._wraps) + latent[begin:end].reshape(shape)
         return level if self.inner is None else self.inner.values(level)
-
-    def _resize(self, level: Array, shape: Shape, transposed: bool = False) -> Array:
-        """Interpolate ``level`` to ``shape``, or apply the transposed interpolation from ``shape`` to ``level``."""
-        last = len(shape) - 2
-        for axis, n in enumerate(shape[:-1]):
-            m = level.shape[axis]
-            wraps = self._wraps and axis == last
-            matrix = _interpolation(n, m, wraps).T if transposed else _interpolation(m, n, wraps)
-            columns = np.moveaxis(level, axis, 0)
-            rows = matrix @ columns.reshape(m, -1)
-            level = np.moveaxis(rows.reshape(n, *columns.shape[1:]), 0, axis)
-        return level
 
 
 def _levels(shape: Shape) -> list[Shape]:
@@ -90,15 +77,3 @@ def _levels(shape: Shape) -> list[Shape]:
         axes = [-(-n // 2) for n in axes]
         levels.insert(0, (*axes, channels))
     return levels
-
-
-@cache
-def _interpolation(m: int, n: int, wraps: bool) -> scipy.sparse.csr_array:
-    """Return the n x m matrix of linear interpolation from the centres of m cells to the centres of n cells."""
-    x = (np.arange(n) + 0.5) * (m / n) - 0.5
-    left = np.floor(x).astype(int)
-    weight = (x - left).astype(np.float32)
-    columns = np.stack([left, left + 1])
-    columns = columns % m if wraps else np.clip(columns, 0, m - 1)
-    weights = np.stack([1 - weight, weight])
-    return scipy.sparse.csr_array((weights.ravel(), (np.tile(np.arange(n), 2), columns.ravel())), shape=(n, m))
