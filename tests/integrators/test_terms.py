@@ -20,7 +20,7 @@ from pathreplay.integrators.boundary_term import Boundary
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.scene_facts import SceneFacts, facts_of
 from pathreplay.integrators.term import Term, TermResult
-from truth import lit_room, rgb
+from truth import bitmap, lit_room, noise, rgb
 
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}
 COLOUR, DENSITY = "object.bsdf.reflectance.value", "object.interior_medium.sigma_t.data"
@@ -190,11 +190,20 @@ def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:
     assert np.array(grown).max() >= np.array(before.traits.tables.blend_lengths).max()
     assert not np.array_equal(np.array(grown), np.array(before.traits.tables.blend_lengths))
     # Another BSDF on a shape, and another scene.
-    scene.shapes()[0].set_bsdf(mi.load_dict({"type": "conductor"}))
+    scene.shapes()[0].set_bsdf(mi.load_dict({"type": "plastic"}))
     assert integrator._trace_config(scene, None).traits.lobes == 1
-    other = mi.load_dict(lit_room({"type": "dielectric_ad"}))
+    other = mi.load_dict(lit_room({"type": "thindielectric"}))
     assert integrator._trace_config(other, None).traits.lobes == 2
     assert facts_of(other) is not facts_of(scene)
+
+
+@pytest.mark.parametrize("plugin", ["conductor", "dielectric", "dielectric_ad"])
+@pytest.mark.parametrize("nested", [False, True])
+def test_lobes_with_exact_weights_are_not_sampled_again(plugin: str, nested: bool) -> None:
+    relief = {"type": "bumpmap", "bump": bitmap(noise(4, 1, 0, 1)), "inner": {"type": plugin}}
+    scene = mi.load_dict(lit_room(relief if nested else {"type": plugin}))
+    traits = mi.load_dict({"type": "pathreplay"})._trace_config(scene, None).traits
+    assert traits.mirrors and traits.lobes == 0
 
 
 def test_facts_keep_up_with_faces_in_another_order() -> None:

@@ -124,7 +124,7 @@ def missing_edges(trace: TraceConfig, sensor: mi.Sensor, edges: str) -> tuple[st
     moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
     if moving:
         return edges_note(moving, edges), True
-    if edges == "none" and trace.traits.lobes and trace.traits.area_lights:
+    if edges == "none" and trace.traits.mirrors and trace.traits.area_lights:
         return (
             "something moves in a scene with delta lobes and area lights: the motion of edges (silhouettes, borders of "
             "lights) that are seen through glass or mirrors is missing from the gradient"

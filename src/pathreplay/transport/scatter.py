@@ -173,7 +173,7 @@ def _at_surface(
 
     if attached and trace.resamples:
         w = dr.select(free, w_sample, w)
-    if trace.traits.lobes > 0:
+    if trace.traits.mirrors:
         delta = active & kept.delta
         w = dr.select(delta, _delta_weight(trace, v, u, ctx, kept, w_sample, delta), w)
     return w, d, pdf

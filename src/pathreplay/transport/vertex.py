@@ -71,7 +71,7 @@ class TraceConfig:
     @property
     def resamples(self) -> bool:
         """Whether later passes sample BSDFs again with the random numbers of the sampling pass."""
-        return self.traits.lobes > 0 or self.follows
+        return bool(self.traits.mirrors) or self.follows
 
     @property
     def follows(self) -> bool:

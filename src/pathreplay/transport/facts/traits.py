@@ -28,6 +28,8 @@ RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
 # BSDFs that have no narrow lobe of their own. BSDFs nested in them may have one.
 DULL = FRAMES | {MASK, "SmoothDiffuse"}
+# BSDFs whose sampled weights are differentiated correctly: see `scatter._delta_weight`.
+EXACT = frozenset({"SmoothConductor", "SmoothDielectric", "DielectricAD"})
 INSTANCE, PROJECTOR, SPOT, SUNSKY = "Instance", "Projector", "SpotLight", "SunskyEmitter"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Entries of `Tables.groups_at`: WHOLE for shapes whose only edges are outlines, FACETS for flat-shaded meshes."""
@@ -68,7 +70,7 @@ class Traits:
     """Facts about the BSDFs, emitters and shapes of a scene, and about the gradients of their parameters."""
 
     mirrors: tuple[mi.BSDF, ...]  # BSDFs with delta lobes
-    lobes: int  # one more than the largest component index of a delta lobe, 0 if there is none
+    lobes: int  # one more than the largest component index of a delta lobe of `mirrors` that are not `EXACT`
     attachables: tuple[mi.BSDF, ...]  # BSDFs whose smooth lobes may be sampled attached
     detached_names: tuple[str, ...]  # class names of BSDFs with smooth lobes that are never sampled attached
     area_lights: bool  # some emitter has an outline
@@ -110,13 +112,15 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and is_null(node))]
     shapes = [node for node in nodes if isinstance(node, mi.Shape)]
     attachables = _attachables(nodes, shapes)
-    others = [bsdf for bsdf in bsdfs if not _is_attachable(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
+    others = [
+        bsdf for bsdf in bsdfs if not _is_made_of(bsdf, ATTACHABLE) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    ]
     coarse = [shape for shape in shapes if is_mesh(shape) and is_coarse(shape)]
     masked = [n for bsdf in bsdfs if bsdf.class_name() == MASK for n in nodes_of(bsdf) if isinstance(n, mi.BSDF)]
     narrow = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
-        lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
+        lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs if not _is_made_of(bsdf, EXACT)), default=0),
         attachables=tuple(attachables),
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
@@ -280,7 +284,7 @@ def _attachables(nodes: set[mi.Object], shapes: list[mi.Shape]) -> list[mi.BSDF]
     of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
     seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
     bsdfs = {node for node in nodes if isinstance(node, mi.BSDF)} - (of_lamps - seen)
-    return [bsdf for bsdf in bsdfs if _is_attachable(bsdf)]
+    return [bsdf for bsdf in bsdfs if _is_made_of(bsdf, ATTACHABLE)]
 
 
 def is_painted(emitter: mi.Emitter | mi.EmitterPtr) -> bool | mi.Bool:
@@ -306,8 +310,9 @@ def _delta_lobes(bsdf: mi.BSDF) -> int:
     return max(delta) + 1 if delta else 0
 
 
-def _is_attachable(bsdf: mi.BSDF) -> bool:
-    name = bsdf.class_name()
-    if name in FRAMES:
-        return all(_is_attachable(nested) for nested in nodes_of(bsdf) if isinstance(nested, mi.BSDF))
-    return name in ATTACHABLE
+def _is_made_of(bsdf: mi.BSDF, kinds: frozenset[str]) -> bool:
+    """Return whether a BSDF, or every BSDF in its `FRAMES`, is one of ``kinds``."""
+    if bsdf.class_name() in FRAMES:
+        return all(_is_made_of(nested, kinds) for nested in nodes_of(bsdf) if isinstance(nested, mi.BSDF))
+    # Mitsuba calls Python plugins by the name of their base class.
+    return not kinds.isdisjoint((bsdf.class_name(), type(bsdf).__name__))
