@@ -6,7 +6,7 @@ medium, and the free flight has a weight and emission of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +15,7 @@ from pathreplay.platform import compat
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.emitters import emission, vertex_glow
 from pathreplay.transport.facts.traits import is_null
-from pathreplay.transport.surface import met, steady
+from pathreplay.transport.surface import met, met_with_normal, steady
 from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexRecord
 from pathreplay.transport.volume.flight import Flown, fly, fly_again
 from pathreplay.transport.volume.media import interaction
@@ -31,7 +31,7 @@ class Vertex:
     origin: mi.Interaction3f  # origin of the rays that leave the vertex
     glow: mi.Spectrum  # radiance emitted towards the ray's origin, MIS weighted
     inside: InMedium = None  # type: ignore[assignment]  # None in scenes without media
-    n: mi.Vector3f = None  # type: ignore[assignment]  # differentiable geometric normal in the shading frame; None on camera paths
+    n: mi.Vector3f = None  # type: ignore[assignment]  # geometric normal in the shading frame: see `met_with_normal`; None on camera paths and if not attached
 
     def met(self, go_on: mi.Bool) -> mi.Bool:
         """Return whether the ray hit a surface or had a collision. Collisions at the end of a path do not count."""
@@ -83,18 +83,20 @@ def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.B
     is differentiable in the density of the ray.
     """
     at, kept = again.at, again.kept
-    with dr.suspend_grad(when=not attached):
-        si = (
-            met(at.hit, at.ray, active)
-            if attached
-            else at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
-        )
+    n: mi.Vector3f = None  # type: ignore[assignment]
+    if not attached:
+        with dr.suspend_grad():
+            si = at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
+    elif trace.to_sensor is None:
+        si = met(at.hit, at.ray, active)
+    else:
+        si, n = met_with_normal(at.hit, at.ray, active)
     if kept.media is None:
         known = None if kept.known is None or attached else kept.known.glow
-        return _on_surface(trace, at, si, attached, active, known)
+        return replace(_on_surface(trace, at, si, attached, active, known), n=n)
     reach = dr.select(si.is_valid(), si.t, dr.inf)
     flown = fly_again(trace, at, kept.media.flight, reach, attached, active)
-    return _in_medium(trace, at, si, kept.media.flight, flown, attached, active)
+    return replace(_in_medium(trace, at, si, kept.media.flight, flown, attached, active), n=n)
 
 
 def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:

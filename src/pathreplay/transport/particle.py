@@ -14,7 +14,6 @@ from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport import arrive, scatter
 from pathreplay.transport.sensor import SensorLink
 from pathreplay.transport.start import occluder
-from pathreplay.transport.surface import normal_in_frame
 from pathreplay.transport.vertex import (
     Arrival,
     Flight,
@@ -80,7 +79,6 @@ def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active:
     v = arrive.repeat(trace, again, attached, active)
     with dr.suspend_grad(when=not attached):
         to = link.sight(v.origin, again.u.light, lit)
-        v.n = normal_in_frame(again.at.hit, again.at.ray, v.si, active)
     c, (w, d, pdf) = scatter.towards(v, ctx, to.d, lit)[0] * to.W, scatter.repeat(trace, v, again, ctx, attached)
     if v.inside is not None:
         T = shadow_again(trace, v.origin.spawn_ray_to(to.end), again.kept.media.shadow, attached, lit)

@@ -63,21 +63,40 @@ def steady(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Su
     return dr.select(active & si.is_valid() & si.shape.is_mesh(), turned, si)
 
 
-def normal_in_frame(
-    hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, active: mi.Bool
-) -> mi.Vector3f:
-    """Return the geometric normal in the shading frame of ``si``, differentiable in the shape only.
+def met_with_normal(
+    hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
+    """Return `met`, and the geometric normal in the shading frame, differentiable in the shape only.
 
-    The position on the shape is constant. On a mesh with interpolated normals, the normal in the shading frame drifts
-    as the position moves within a triangle, and jumps back at the edge to the next triangle. Drift and jumps nearly
-    cancel in the mean, but automatic differentiation would include the drift only.
+    The position on the shape is constant in the normal. On a mesh with interpolated normals, the normal in the shading
+    frame drifts as the position moves within a triangle, and jumps back at the edge to the next triangle. Drift and
+    jumps nearly cancel in the mean, but automatic differentiation would include the drift only.
+
+    To first order, a hit point moves with its shape, and slides over the static shape along a ray that moves relative
+    to the shape. The two motions are computed separately. The former also gives the normal, and the arrays of the shape
+    then receive one gradient, not two.
     """
-    n = dr.detach(si.to_local(si.n))
-    y = hit.compute_surface_interaction(ray, compat.shading() | compat.follow_shape(), active)
-    if not dr.grad_enabled(y.n, y.sh_frame.n):
-        return n
-    turned = dr.detach(si).to_local(dr.detach(y).to_world(y.to_local(y.n)))
-    return dr.replace_grad(n, dr.select(active, turned, n))
+    y = hit.compute_surface_interaction(dr.detach(ray), compat.shading() | compat.follow_shape(), active)
+    if not dr.grad_enabled(y):
+        si = met(hit, ray, active)
+        return si, dr.detach(si.to_local(si.n))
+    relative = mi.Ray3f(ray)
+    relative.o = ray.o - _motion(y.p)
+    with dr.suspend_grad(), dr.resume_grad(relative.o, relative.d):
+        si = met(hit, relative, active)
+    for moved, followed, names in (
+        (si, y, ("p", "n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv")),
+        (si.sh_frame, y.sh_frame, ("s", "t", "n")),
+    ):
+        for name in names:
+            setattr(moved, name, getattr(moved, name) + _motion(getattr(followed, name)))
+    si.wi = si.to_local(-ray.d)
+    return si, dr.replace_grad(dr.detach(si.to_local(si.n)), y.to_local(y.n))
+
+
+def _motion(value: T) -> T:
+    """Return zero with the derivatives of ``value``."""
+    return dr.replace_grad(type(value)(0), value)
 
 
 @dataclass
