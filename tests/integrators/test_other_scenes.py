@@ -112,6 +112,6 @@ def test_forward_mode_says_what_is_in_the_way() -> None:
     params[PLACE] = translate(1, 0, 0)(params[PLACE], t)
     params.update()
     dr.forward(t, dr.ADFlag.ClearEdges)
-    with pytest.raises(PathreplayError, match="detach the parameters of other scenes") as caught:
+    with pytest.raises(PathreplayError, match="also those of other scenes") as caught:
         mi.load_dict({"type": "pathreplay", "max_depth": 3}).render_forward(scene, params, spp=1)
     assert "\n" not in str(caught.value)

@@ -42,8 +42,9 @@ _OUTSIDE = "outside of the current dr.isolate_grad() scope"
 """Part of Dr.Jit's message about edges of its AD graph that a pass must not traverse."""
 _UNPROPAGATED = (
     "forward mode: tangents have not been propagated to all parameters that this pass traces: call "
-    "dr.forward(x, dr.ADFlag.ClearEdges) before it if the parameters are computed from a variable x, and detach the "
-    "parameters of other scenes that are alive (params[key] = dr.detach(params[key]), then params.update())"
+    "dr.forward(x, dr.ADFlag.ClearEdges) before it for each variable x from which parameters are computed, and detach "
+    "parameters without tangents, also those of other scenes that are alive (params[key] = dr.detach(params[key]), "
+    "then params.update())"
 )
 
 
