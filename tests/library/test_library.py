@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -88,6 +89,26 @@ def test_a_job_and_the_library_give_the_same_bits(photos: list[np.ndarray], tmp_
         np.testing.assert_array_equal(result.values[key], of_job[key])
     history = [json.loads(line) for line in (folder / "history.jsonl").read_text().splitlines()]
     assert [entry.loss for entry in result.history] == [entry["loss"] for entry in history]
+
+
+def test_an_evaluation_beside_another_thread_leaves_the_scene_alone(photos: list[np.ndarray]) -> None:
+    """It is refused before it sets values: those of the thread that renders stay in the scene."""
+    problem = Problem(room(), {WALL: Parameter(initial=[0.4, 0.5, 0.6])}, views(photos), spp=4)
+    f, told = pathreplay.value_and_grad(problem), []
+
+    def work() -> None:
+        try:
+            f({WALL: [0.9, 0.9, 0.9]})
+        except PathreplayError as error:
+            told.append(str(error))
+
+    f()
+    with pathreplay.exclusive():
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    assert len(told) == 1 and "another Python thread is rendering" in told[0]
+    np.testing.assert_allclose(np.array(problem.built.params[WALL]).ravel(), [0.4, 0.5, 0.6], rtol=1e-6)
 
 
 def test_value_and_grad_is_the_gradient_of_the_loss(photos: list[np.ndarray]) -> None:
@@ -255,6 +276,12 @@ def test_files_and_bitmaps_are_read_as_by_a_job(tmp_path: Path) -> None:
         ):
             np.testing.assert_allclose(found[0], target, rtol=1e-6)
             np.testing.assert_allclose(found[1], weight, rtol=1e-6)
+
+
+def test_bitmaps_in_xyz_are_converted(photos: list[np.ndarray]) -> None:
+    bitmap = mi.Bitmap(photos[0]).convert(pixel_format=mi.Bitmap.PixelFormat.XYZ)
+    view = Problem(room(), {WALL: GREY}, View(0, bitmap)).built.views[0]
+    np.testing.assert_allclose(view.target, photos[0], atol=1e-5)
 
 
 XML = """<scene version="3.0.0">

@@ -115,35 +115,47 @@ def exclusive() -> Iterator[None]:
 
 
 @contextmanager
-def careful() -> Iterator[None]:
-    """Context of a pass, in which the rules of this module hold and errors are unwrapped (see `plain_errors`).
+def one_renderer() -> Iterator[None]:
+    """Context in which a single Python thread renders and changes scenes.
 
-    Raises PathreplayError if another thread is in a pass or in an `exclusive` block.
+    Raises PathreplayError if another thread is in such a context, in a pass, or in an `exclusive` block.
     """
-    global _passes, _last_thread
     if not _acquire():
         raise PathreplayError(
             "pathreplay: another Python thread is rendering, and Dr.Jit computes wrong results if two use it at once: "
             "put all that each thread does with Mitsuba into 'with pathreplay.exclusive():', or use processes"
         )
-    collecting = gc.isenabled()
     try:
-        if _passes == 0 and not is_recording():
-            SCENES.release()
-        gc.disable()
-        _passes += 1
-        _last_thread = threading.get_ident()
-        try:
-            with plain_errors():
-                yield
-        finally:
-            _passes -= 1
-            if is_recording():
-                _hide_garbage()
+        yield
     finally:
-        if collecting:
-            gc.enable()
         _ONE_THREAD.release()
+
+
+@contextmanager
+def careful() -> Iterator[None]:
+    """Context of a pass, in which the rules of this module hold and errors are unwrapped (see `plain_errors`).
+
+    Raises PathreplayError like `one_renderer`.
+    """
+    global _passes, _last_thread
+    with one_renderer():
+        collecting = gc.isenabled()
+        try:
+            if _passes == 0 and not is_recording():
+                SCENES.release()
+            gc.disable()
+            _passes += 1
+            _last_thread = threading.get_ident()
+            try:
+                with plain_errors():
+                    yield
+            finally:
+                _passes -= 1
+                if is_recording():
+                    _hide_garbage()
+        finally:
+            if collecting:
+                gc.enable()
 
 
 def _acquire() -> bool:

@@ -18,6 +18,7 @@ from pathreplay.integrators.diagnostics import COST_OF_EDGES
 from pathreplay.integrators.edge_notes import edges_note, moves_edges
 from pathreplay.integrators.film.image import fit_film
 from pathreplay.integrators.integrator import EDGES
+from pathreplay.integrators.lifetimes import one_renderer
 from pathreplay.integrators.reach import reached_sensors
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import TARGET, Config
@@ -126,12 +127,12 @@ class Problem:
     def computing(self) -> Iterator[None]:
         """Return a context for renderings: it turns errors of integrators into PathreplayError, and limits the memory.
 
-        Deterministic jobs use one thread.
+        Deterministic jobs use one thread. Raises PathreplayError if another Python thread is rendering.
         """
         config = self.config
         names = "' or '".join(plugin.type for plugin in (config.integrator, config.baseline) if plugin is not None)
         problem = f"Integrator '{names}' cannot do this job"
-        with one_thread(config.deterministic), errors_as(problem), memory.within(config.budget):
+        with one_renderer(), one_thread(config.deterministic), errors_as(problem), memory.within(config.budget):
             yield
 
     def moves(self, moving: frozenset[str]) -> set[str]:
