@@ -23,8 +23,9 @@ from pathreplay.inverse.dataset.capture import pinhole_camera, read_capture
 from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.inverse.images.io import exr_bytes, read_image
 from pathreplay.jobs import make_config, optimize
-from pathreplay.output.export import export_run, write_files
+from pathreplay.output.export import export_run, obj_bytes, write_files
 from pathreplay.output.scene_folder import Exported, Source, exported, require_same
+from pathreplay.platform.compat import mesh_arrays
 from pathreplay.scenes.builtin import BUILTINS
 from pathreplay.scenes.caustics import sheet
 from pathreplay.scenes.parameters import get_array
@@ -448,3 +449,18 @@ def test_a_volume_and_a_mesh_of_runs_come_out(tmp_path: Path, monkeypatch: pytes
         for ending in ("ply", "obj")
     }
     assert sizes == {2048}
+
+
+def test_obj_files_have_the_data_of_the_mesh(tmp_path: Path) -> None:
+    mesh = mi.load_dict({"type": "cube"})
+    (tmp_path / "cube.obj").write_bytes(obj_bytes(mesh))
+    again = mi.load_dict({"type": "obj", "filename": str(tmp_path / "cube.obj")})
+
+    def rows(shape: mi.Shape) -> np.ndarray:
+        """Position, texture coordinates and normal of each vertex, sorted."""
+        data = mesh_arrays(mi.traverse(shape))
+        assert data is not None
+        table = np.concatenate([data.positions, data.texcoords, data.normals], axis=1).round(5) + 0.0
+        return table[np.lexsort(table.T)]
+
+    np.testing.assert_allclose(rows(again), rows(mesh), atol=1e-5)

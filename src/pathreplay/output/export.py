@@ -209,12 +209,16 @@ def _json(table: object) -> bytes:
 
 
 def obj_bytes(mesh: mi.Mesh) -> bytes:
-    """Encode the mesh as a Wavefront OBJ file: vertices, texture coordinates, normals, faces."""
+    """Encode the mesh as a Wavefront OBJ file: vertices, texture coordinates, normals, faces.
+
+    In OBJ files, v points upwards in the image. In the data of a mesh, as in PLY files, v points downwards.
+    """
     data = compat.mesh_arrays(mi.traverse(mesh))
     if data is None:
         raise PathreplayError(f"The vertices of shape '{mesh.id()}' are not accessible, so it cannot be written as OBJ")
     lines, has = [], []
-    for rows, tag in ((data.positions, "v"), (data.texcoords, "vt"), (data.normals, "vn")):
+    texcoords = data.texcoords * (1, -1) + (0, 1)
+    for rows, tag in ((data.positions, "v"), (texcoords, "vt"), (data.normals, "vn")):
         has.append(len(rows) > 0)
         lines += [f"{tag} " + " ".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
     for face in data.faces + 1:
