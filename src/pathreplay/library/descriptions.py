@@ -91,7 +91,8 @@ class View:
         sensor: index or id of the sensor.
         target: linear pixels (height, width, channels): a NumPy or Dr.Jit array, a `mi.Bitmap`, or an image file.
             Bitmaps and files are decoded from sRGB if they have 8 or 16 bits, and composited over black. Arrays of
-            8- or 16-bit integers are refused, because their encoding is unknown.
+            8- or 16-bit integers are refused, because their encoding is unknown. Mitsuba takes the colours of a bitmap
+            that was made from an array for premultiplied by alpha; see ``mi.Bitmap.set_premultiplied_alpha``.
         weight: nonnegative pixel weights (height, width), normalised to mean 1: an array, a `mi.Bitmap` or an image
             file. The stored values of bitmaps and files are used, without decoding; colours are converted to luminance.
             Default: equal weights.

@@ -12,7 +12,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import picture_shape
 from pathreplay.inverse.dataset.targets import Targets, as_weight
 from pathreplay.inverse.dataset.views import sensors_of
-from pathreplay.inverse.images.io import Image, find_image, over_black, read_image
+from pathreplay.inverse.images.io import Image, find_image, in_rgb, over_black, read_image
 from pathreplay.inverse.parameters.values import adapted_image
 from pathreplay.library.descriptions import View
 
@@ -85,7 +85,7 @@ def _pixels(what: str, value: object, *, stored: bool = False) -> Image:
 
 def _floats(bitmap: mi.Bitmap, stored: bool) -> mi.Bitmap:
     """Convert a bitmap to floats; for ``stored`` see `_pixels`. Bitmaps of PNG files have straight alpha."""
-    transform = mi.Bitmap.AlphaTransform.Empty
+    transform, bitmap = mi.Bitmap.AlphaTransform.Empty, in_rgb(bitmap)
     # Mitsuba marks bitmaps of 16-bit files as sRGB, but not those of 16-bit arrays.
     if stored or bitmap.component_format() == mi.Struct.Type.UInt16:
         bitmap = mi.Bitmap(bitmap)

@@ -54,6 +54,19 @@ def test_pixmaps_are_read_as_their_heads_say(data: bytes, rounding: float, tmp_p
     assert image.dtype == np.float32 and image == pytest.approx(picture(image.shape[2]), abs=rounding)
 
 
+def test_bitmaps_with_palettes_have_the_colours_of_the_palette(tmp_path: Path) -> None:
+    few = PIL.Image.fromarray((encoded(picture()) * 255).astype(np.uint8)).quantize(16)
+    grey = few.convert("L")
+    few.save(tmp_path / "few.bmp")
+    few.save(tmp_path / "few.png")
+    grey.save(tmp_path / "grey.bmp")
+    grey.save(tmp_path / "grey.png")
+    for name, channels in (("few", 3), ("grey", 1)):
+        image = read_image(tmp_path / f"{name}.bmp")
+        assert image.shape[2] == channels
+        np.testing.assert_allclose(image, read_image(tmp_path / f"{name}.png"), atol=1e-6)
+
+
 FORMAT = "FORMAT=32-bit_rle_rgbe\n"
 UPRIGHT = f"-Y {HEIGHT} +X {WIDTH}"
 HEADS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {

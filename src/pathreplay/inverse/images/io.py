@@ -88,13 +88,19 @@ def read_image(path: Path, *, raw: bool = False, pixels: int = MOST_PIXELS) -> I
 
 def _linear(bitmap: mi.Bitmap) -> Image:
     """Return the linear pixels of a bitmap, after decoding sRGB if necessary."""
-    formats = mi.Bitmap.PixelFormat
-    if bitmap.pixel_format() in (formats.XYZ, formats.XYZA):
-        bitmap = bitmap.convert(pixel_format=formats.RGB if bitmap.channel_count() == 3 else formats.RGBA)
+    bitmap = in_rgb(bitmap)
     # Linear bitmaps of floats are not converted, because Mitsuba's conversion relies on the names of channels.
     if bitmap.srgb_gamma() or bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16):
         bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
     return np.asarray(bitmap).astype(np.float32, copy=False)
+
+
+def in_rgb(bitmap: mi.Bitmap) -> mi.Bitmap:
+    """Convert a bitmap in XYZ to RGB; return any other bitmap."""
+    formats = mi.Bitmap.PixelFormat
+    if bitmap.pixel_format() not in (formats.XYZ, formats.XYZA):
+        return bitmap
+    return bitmap.convert(pixel_format=formats.RGB if bitmap.channel_count() == 3 else formats.RGBA)
 
 
 def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
@@ -105,7 +111,22 @@ def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
             return _pixmap(file, pixmap_head(magic + file.read(MOST_HEAD))), lambda image: image
         if magic == b"#?":
             return _radiance(file, radiance_head(magic + file.read(MOST_HEAD)))
+        if magic == b"BM" and (colours := _from_palette(path)) is not None:
+            return colours, lambda image: image
     return mi.Bitmap(str(path)), lambda image: image
+
+
+def _from_palette(path: Path) -> mi.Bitmap | None:
+    """Read a BMP file with a palette of colours, which Mitsuba's reader ignores; return None for any other file."""
+    # Mitsuba reports errors. Pillow's warnings about large images are irrelevant here.
+    with contextlib.suppress(OSError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with PIL.Image.open(path) as picture:
+            if picture.mode == "P":
+                bitmap = mi.Bitmap(np.array(picture.convert("RGB")))
+                bitmap.set_srgb_gamma(True)
+                return bitmap
+    return None
 
 
 def _pixmap(file: BinaryIO, head: PixmapHead) -> mi.Bitmap:
