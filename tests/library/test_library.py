@@ -94,21 +94,26 @@ def test_a_job_and_the_library_give_the_same_bits(photos: list[np.ndarray], tmp_
 def test_an_evaluation_beside_another_thread_leaves_the_scene_alone(photos: list[np.ndarray]) -> None:
     """It is refused before it sets values: those of the thread that renders stay in the scene."""
     problem = Problem(room(), {WALL: Parameter(initial=[0.4, 0.5, 0.6])}, views(photos), spp=4)
-    f, told = pathreplay.value_and_grad(problem), []
+    f, state, told = pathreplay.value_and_grad(problem), pathreplay.init(problem), []
 
     def work() -> None:
-        try:
-            f({WALL: [0.9, 0.9, 0.9]})
-        except PathreplayError as error:
-            told.append(str(error))
+        for evaluate in (lambda: f({WALL: [0.9, 0.9, 0.9]}), lambda: pathreplay.step(problem, state)):
+            try:
+                evaluate()
+            except PathreplayError as error:
+                told.append(str(error))
 
     f()
+    params = problem.built.params
     with pathreplay.exclusive():
+        dr.enable_grad(params[WALL])
         thread = threading.Thread(target=work)
         thread.start()
         thread.join()
-    assert len(told) == 1 and "another Python thread is rendering" in told[0]
-    np.testing.assert_allclose(np.array(problem.built.params[WALL]).ravel(), [0.4, 0.5, 0.6], rtol=1e-6)
+    assert len(told) == 2 and all("another Python thread is rendering" in text for text in told)
+    assert dr.grad_enabled(params[WALL])
+    np.testing.assert_allclose(np.array(params[WALL]).ravel(), [0.4, 0.5, 0.6], rtol=1e-6)
+    dr.disable_grad(params[WALL])
 
 
 def test_value_and_grad_is_the_gradient_of_the_loss(photos: list[np.ndarray]) -> None:

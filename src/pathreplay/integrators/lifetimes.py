@@ -16,7 +16,8 @@ including the objects of other scenes. Four rules follow, which this module enfo
    during the whole call of a frozen function.
 4. Only one Python thread renders at a time. All threads of a process share Dr.Jit's registry and memory. Threads that
    trace or launch kernels concurrently get wrong results or crash the process. A pass therefore raises an error if
-   another thread has a pass in progress; `exclusive` lets threads take turns.
+   another thread has a pass in progress; `exclusive` lets threads take turns. `one_renderer` does the same for steps of
+   an optimisation, which also change the scene.
 """
 
 from __future__ import annotations

@@ -147,12 +147,12 @@ def step(problem: Problem, state: State) -> State:
         )
     optimiser = task.optimiser_at(state, built)
     run = Run(executor, optimiser, dict(state._next), state._learned, list(state.history))
-    try:
-        with built.computing():
+    with built.computing():
+        try:
             take_step(built, run, min(len(state.history), built.config.iterations - 1))
-    finally:
-        restore_films(built)
-        inner.detach(built)
+        finally:
+            restore_films(built)
+            inner.detach(built)
     require_gradients(built, run)
     found = best_values(built, run)
     kept = _copied(optimiser.state())

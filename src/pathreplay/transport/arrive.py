@@ -6,7 +6,7 @@ medium, and the free flight has a weight and emission of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -31,7 +31,7 @@ class Vertex:
     origin: mi.Interaction3f  # origin of the rays that leave the vertex
     glow: mi.Spectrum  # radiance emitted towards the ray's origin, MIS weighted
     inside: InMedium = None  # type: ignore[assignment]  # None in scenes without media
-    n: mi.Vector3f = None  # type: ignore[assignment]  # geometric normal in the shading frame: see `met_with_normal`; None on camera paths and if not attached
+    n: mi.Vector3f | None = None  # on attached light paths, the normal of `met_with_normal`
 
     def met(self, go_on: mi.Bool) -> mi.Bool:
         """Return whether the ray hit a surface or had a collision. Collisions at the end of a path do not count."""
@@ -83,7 +83,7 @@ def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.B
     is differentiable in the density of the ray.
     """
     at, kept = again.at, again.kept
-    n: mi.Vector3f = None  # type: ignore[assignment]
+    n: mi.Vector3f | None = None
     if not attached:
         with dr.suspend_grad():
             si = at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
@@ -93,10 +93,13 @@ def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.B
         si, n = met_with_normal(at.hit, at.ray, active)
     if kept.media is None:
         known = None if kept.known is None or attached else kept.known.glow
-        return replace(_on_surface(trace, at, si, attached, active, known), n=n)
-    reach = dr.select(si.is_valid(), si.t, dr.inf)
-    flown = fly_again(trace, at, kept.media.flight, reach, attached, active)
-    return replace(_in_medium(trace, at, si, kept.media.flight, flown, attached, active), n=n)
+        v = _on_surface(trace, at, si, attached, active, known)
+    else:
+        reach = dr.select(si.is_valid(), si.t, dr.inf)
+        flown = fly_again(trace, at, kept.media.flight, reach, attached, active)
+        v = _in_medium(trace, at, si, kept.media.flight, flown, attached, active)
+    v.n = n
+    return v
 
 
 def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:

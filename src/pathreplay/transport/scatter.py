@@ -149,9 +149,10 @@ def _at_surface(
         d, J = moved_direction(trace.traits.tables.blend_lengths, si, kept.d, again.hit_next, holds)
 
     if trace.resamples:
-        sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
+        drawn = active if trace.follows else active & kept.delta
+        sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, drawn)
         if ctx.mode == mi.TransportMode.Importance:
-            w_sample = _adjoint_weight(v, sample, w_sample, active if trace.follows else active & kept.delta)
+            w_sample = _adjoint_weight(v, sample, w_sample, drawn)
         if attached:
             free = _followed(trace, v, u, ctx, smooth)
             follows = free | (active & kept.delta)
@@ -239,7 +240,8 @@ def _delta_weight(
     (``thindielectric``, ``plastic``) the derivative of the Fresnel term is lost in this cancellation. The lobe is
     therefore sampled again alone, through ``BSDFContext.component``, and its weight is divided by the detached
     selection probability. If weight or direction then differ from the original sample, the plugin does not support
-    restricted sampling, and the derivative of the original weight is used.
+    restricted sampling, and the derivative of the original weight is used. BSDFs made of `EXACT` ones return weights
+    with the right derivative, and are not sampled again unless other BSDFs require it.
     """
     drawn = dr.detach(w)
     missing = mi.Bool(active)

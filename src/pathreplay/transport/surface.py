@@ -18,6 +18,8 @@ UMBILIC = 1e-4
 # Derivatives of hits on spheres and cylinders are set to zero if the cosine between ray and normal is below this value.
 # In compensation, they are doubled between this value and twice this value.
 GRAZES = 0.01
+FIELDS = "p", "n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv"
+"""Fields of an interaction that describe the surface, without the shading frame."""
 
 
 def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
@@ -39,7 +41,7 @@ def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi
 
 def _scaled(si: mi.SurfaceInteraction3f, by: mi.Float) -> mi.SurfaceInteraction3f:
     """Scale the derivatives of the interaction by ``by``; a factor of zero also removes non-finite derivatives."""
-    for name in ("t", "p", "n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv", "wi"):
+    for name in (*FIELDS, "t", "wi"):
         setattr(si, name, _times(getattr(si, name), by))
     frame = si.sh_frame
     frame.s, frame.t, frame.n = (_times(axis, by) for axis in (frame.s, frame.t, frame.n))
@@ -68,13 +70,14 @@ def met_with_normal(
 ) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
     """Return `met`, and the geometric normal in the shading frame, differentiable in the shape only.
 
-    The position on the shape is constant in the normal. On a mesh with interpolated normals, the normal in the shading
-    frame drifts as the position moves within a triangle, and jumps back at the edge to the next triangle. Drift and
-    jumps nearly cancel in the mean, but automatic differentiation would include the drift only.
+    The normal is that of a constant position on the shape. On a mesh with interpolated normals, the normal in the
+    shading frame drifts as the position moves within a triangle, and jumps back at the edge to the next triangle. Drift
+    and jumps nearly cancel in the mean, but automatic differentiation would include the drift only.
 
     To first order, a hit point moves with its shape, and slides over the static shape along a ray that moves relative
     to the shape. The two motions are computed separately. The former also gives the normal, and the arrays of the shape
-    then receive one gradient, not two.
+    then receive one gradient, not two. Near silhouettes, only the slide is modified as described in `met`: the motion
+    with the shape is bounded.
     """
     y = hit.compute_surface_interaction(dr.detach(ray), compat.shading() | compat.follow_shape(), active)
     if not dr.grad_enabled(y):
@@ -84,13 +87,10 @@ def met_with_normal(
     relative.o = ray.o - _motion(y.p)
     with dr.suspend_grad(), dr.resume_grad(relative.o, relative.d):
         si = met(hit, relative, active)
-    for moved, followed, names in (
-        (si, y, ("p", "n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv")),
-        (si.sh_frame, y.sh_frame, ("s", "t", "n")),
-    ):
+    for moved, followed, names in ((si, y, FIELDS), (si.sh_frame, y.sh_frame, ("s", "t", "n"))):
         for name in names:
             setattr(moved, name, getattr(moved, name) + _motion(getattr(followed, name)))
-    si.wi = si.to_local(-ray.d)
+    si.wi = dr.select(si.is_valid(), si.to_local(-ray.d), -ray.d)
     return si, dr.replace_grad(dr.detach(si.to_local(si.n)), y.to_local(y.n))
 
 
@@ -117,10 +117,11 @@ def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
     degenerate, and change if the texture coordinates move.
     """
     on_mesh = active & hit.shape.is_mesh()
-    flat, A = compat.triangle_point(hit, ray, on_mesh)
+    x, A = compat.triangle_point(hit, ray, on_mesh)
+    on_triangle = SurfacePoint(x.p, A, dr.detach(x.n), mi.Float(0))
     y = hit.compute_surface_interaction(ray, compat.normal_partials() | compat.follow_shape(), active & ~on_mesh)
-    round_ = SurfacePoint(y.p, dr.cross(y.dp_du, y.dp_dv), dr.detach(y.n), _curvature(dr.detach(y)))
-    return dr.select(on_mesh, SurfacePoint(flat.p, A, dr.detach(flat.n), mi.Float(0)), round_)
+    elsewhere = SurfacePoint(y.p, dr.cross(y.dp_du, y.dp_dv), dr.detach(y.n), _curvature(dr.detach(y)))
+    return dr.select(on_mesh, on_triangle, elsewhere)
 
 
 def solid_angle(y: SurfacePoint, origin: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Float, mi.Float]:

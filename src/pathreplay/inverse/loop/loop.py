@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import replace
 
 import drjit as dr
@@ -131,7 +131,7 @@ def best_values(problem: Problem, run: Run) -> dict[str, Array]:
     return {v.key: np.clip(best[v.key], *v.bounds) if v.key in best else run.values[v.key] for v in problem.variables}
 
 
-def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
+def iterate(problem: Problem, run: Run, stop: Stop) -> Generator[Event, None, None]:
     """Take steps from ``len(run.history)`` to ``iterations``, and yield the events of the run.
 
     A run may have a baseline: a second run, by another integrator, for comparison. After each step of the run, the
@@ -186,12 +186,16 @@ def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
 def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
     """Yield the events of `iterate`. The context `Problem.computing` encloses the steps, but not the caller."""
     events = iterate(problem, run, stop)
-    while True:
-        with problem.computing():
-            event = next(events, None)
-        if event is None:
-            return
-        yield event
+    try:
+        while True:
+            with problem.computing():
+                event = next(events, None)
+            if event is None:
+                return
+            yield event
+    finally:
+        with problem.computing():  # the end of an incomplete iteration restores the scene
+            events.close()
 
 
 def require_gradients(problem: Problem, run: Run) -> None:

@@ -52,14 +52,16 @@ def resampled(grid: Array, shape: Sequence[int], wraps: bool = False) -> Array:
 
     If ``wraps``, the x axis (the one before the channels) is periodic, as in environment maps. The number of channels
     stays the same. Textures and volumes of Mitsuba interpolate in the same way, so doubling the resolution hardly
-    changes the texture. The result stays within the range of the values. Downsampling by more than a factor of two
-    skips entries.
+    changes the texture. Downsampling by more than a factor of two skips entries. The result is clipped to the range of
+    the values, which rounding errors could leave.
     """
-    return np.clip(interpolated(grid, shape, wraps), grid.min(), grid.max())
+    low, high = np.float32(grid.min()), np.float32(grid.max())
+    values = interpolated(grid, shape, wraps)
+    return np.clip(values, low, high, out=values)
 
 
 def interpolated(grid: Array, shape: Sequence[int], wraps: bool, transposed: bool = False) -> Array:
-    """Return `resampled` values up to rounding errors, which may leave the range of the values.
+    """Interpolate a grid as in `resampled`, without clipping.
 
     With ``transposed``, the transpose of the interpolation from ``shape`` to the shape of the grid is applied.
     """

@@ -70,7 +70,7 @@ class Traits:
     """Facts about the BSDFs, emitters and shapes of a scene, and about the gradients of their parameters."""
 
     mirrors: tuple[mi.BSDF, ...]  # BSDFs with delta lobes
-    lobes: int  # one more than the largest component index of a delta lobe of `mirrors` that are not `EXACT`
+    lobes: int  # one more than the largest component index of a delta lobe, without BSDFs made of `EXACT` ones
     attachables: tuple[mi.BSDF, ...]  # BSDFs whose smooth lobes may be sampled attached
     detached_names: tuple[str, ...]  # class names of BSDFs with smooth lobes that are never sampled attached
     area_lights: bool  # some emitter has an outline
@@ -311,8 +311,9 @@ def _delta_lobes(bsdf: mi.BSDF) -> int:
 
 
 def _is_made_of(bsdf: mi.BSDF, kinds: frozenset[str]) -> bool:
-    """Return whether a BSDF, or every BSDF in its `FRAMES`, is one of ``kinds``."""
+    """Return whether a BSDF is one of ``kinds``. A BSDF of `FRAMES` counts if all BSDFs nested in it do."""
     if bsdf.class_name() in FRAMES:
         return all(_is_made_of(nested, kinds) for nested in nodes_of(bsdf) if isinstance(nested, mi.BSDF))
-    # Mitsuba calls Python plugins by the name of their base class.
-    return not kinds.isdisjoint((bsdf.class_name(), type(bsdf).__name__))
+    # Mitsuba calls Python plugins, such as `dielectric_ad`, by the name of their base class.
+    ours = type(bsdf).__module__.startswith("pathreplay.")
+    return (type(bsdf).__name__ if ours else bsdf.class_name()) in kinds
