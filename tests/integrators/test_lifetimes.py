@@ -19,6 +19,7 @@ import pytest
 
 import pathreplay
 from edge_scenes import cube8, lit_box
+from pathreplay.integrators import lifetimes
 from pathreplay.integrators.lifetimes import SceneMemory, careful
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.transport.facts.nodes import nodes_of, with_gradients
@@ -216,6 +217,25 @@ class Collecting:
     @value.setter
     def value(self, value: mi.Float) -> None:
         self._value = value
+
+
+def test_objects_that_others_have_hidden_are_counted_once_between_full_collections(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Counting a million of them takes a tenth of a second."""
+    counts: list[int] = []
+    monkeypatch.setattr(gc, "get_freeze_count", lambda: counts.append(1) or 7)
+    monkeypatch.setattr(gc, "freeze", lambda: pytest.fail("objects of others were mixed with ours"))
+    monkeypatch.setattr(lifetimes, "_hidden", False)
+    gc.collect()
+    with without_collector():
+        for _ in range(3):
+            lifetimes._hide_garbage()
+    assert len(counts) == 1
+    gc.collect()
+    lifetimes._hide_garbage()
+    assert len(counts) == 2
+    gc.collect()
 
 
 def test_no_scene_is_released_while_a_frozen_function_is_called() -> None:

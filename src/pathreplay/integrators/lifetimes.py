@@ -92,7 +92,8 @@ _AT_COLLECTION = threading.Lock()
 """Locked while `_on_collection` may hold `_ONE_THREAD`. A pass then waits briefly instead of raising an error."""
 _passes = 0  # number of nested passes in progress
 _last_thread = 0  # thread of the last pass. It may be tracing, so collections in other threads release no scene.
-_hidden = False  # whether objects are hidden from the collector
+_hidden = False  # whether this module has hidden objects from the collector
+_hidden_by_others = False  # whether other code had hidden objects when they were last counted
 
 
 def is_recording() -> bool:
@@ -189,16 +190,24 @@ def plain_errors() -> Iterator[None]:
 
 
 def _hide_garbage() -> None:
-    """Hide all objects from the collector in constant time, unless other code has hidden any. See `_on_collection`."""
-    global _hidden
-    if _hidden or gc.get_freeze_count() == 0:
+    """Hide all objects from the collector, unless other code has hidden any. See `_on_collection`.
+
+    Hiding takes constant time. Counting takes time for each hidden object. Objects that other code has hidden are
+    therefore counted only once between full collections.
+    """
+    global _hidden, _hidden_by_others
+    if not _hidden and not _hidden_by_others:
+        _hidden_by_others = gc.get_freeze_count() > 0
+    if not _hidden_by_others:
         gc.freeze()
         _hidden = True
 
 
 def _on_collection(phase: str, info: dict[str, int]) -> None:
     """Handle a garbage collection: make hidden objects visible before it, and release scenes after it."""
-    global _hidden
+    global _hidden, _hidden_by_others
+    if phase == "stop" and info["generation"] == 2:
+        _hidden_by_others = False
     if is_recording() or not _AT_COLLECTION.acquire(blocking=False):
         return
     try:
