@@ -16,10 +16,12 @@ import PIL.Image
 import pytest
 
 from page_samples import HOSTILE, sample
+from pathreplay.inverse.config.schema import make_config
+from pathreplay.inverse.images.io import exposure_for
 from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.report.drawing import own_settings
 from pathreplay.report.outcome import Recovered, ViewPictures
-from pathreplay.report.page_parts import common_exposure, plots
+from pathreplay.report.page_parts import common_exposure, facts, plots
 from pathreplay.report.pages.document import document
 from pathreplay.report.pages.page import MOST_POINTS, thinned
 from pathreplay.report.report import summary
@@ -94,7 +96,26 @@ def test_a_parameter_that_the_last_stage_freezes_keeps_its_curve() -> None:
 
 def test_one_exposure_is_that_of_all_pixels_together() -> None:
     dark, bright = np.full((4, 4, 3), 0.5, np.float32), np.full((4, 4, 3), 2.0, np.float32)
-    assert common_exposure([dark]) == pytest.approx(2) and common_exposure([dark, bright]) == pytest.approx(0.5)
+    assert common_exposure([(dark, None)]) == pytest.approx(2)
+    assert common_exposure([(dark, None), (bright, None)]) == pytest.approx(0.5)
+
+
+def test_pixels_that_do_not_count_set_no_exposure() -> None:
+    target, weight = np.full((4, 4, 3), 0.5, np.float32), np.full((4, 4, 1), 2.0, np.float32)
+    target[:2], weight[:2] = 9.0, 0.0
+    assert common_exposure([(target, weight)]) == exposure_for(target, weight) == pytest.approx(2)
+    assert common_exposure([(target, None)]) == pytest.approx(1 / 9)
+
+
+def test_samples_of_a_step_are_those_that_were_taken() -> None:
+    """Stages and `spp = "auto"` take others than the job's."""
+    config = make_config({"scene": "s.xml", "target": {"scene": "s.xml"}, "parameters": [{"key": "a"}], "spp": 16})
+
+    def samples(*taken: int) -> str:
+        history = [Entry(i, 1.0, 0.5, {}, spp=spp) for i, spp in enumerate(taken)]
+        return dict((label, value) for value, label in facts(config, history))["samples per pixel and step"]
+
+    assert (samples(), samples(64, 64), samples(16, 64, 8)) == ("16", "64", "8 to 64")
 
 
 @pytest.mark.drawn

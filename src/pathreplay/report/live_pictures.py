@@ -42,7 +42,7 @@ class LivePictures:
         self._problem, self._run, self._stop = problem, run, stop
         preview = problem.config.preview
         self.share = preview.share
-        self.exposure = common_exposure([view.target for view in problem.views])
+        self.exposure = common_exposure((view.target, view.weight) for view in problem.views)
         self.views = _chosen(problem, preview.views) if self.share else []
         start = self._rendered() if before is None else before
         self.before = {view.name: start[view.name] for view in self.views}
@@ -119,7 +119,7 @@ class LivePictures:
 
     def stored(self, view: View) -> float:
         """Return the exposure at which images of a view are encoded."""
-        return min(self.exposure, exposure_for(view.target))
+        return min(self.exposure, exposure_for(view.target, view.weight))
 
 
 def _chosen(problem: Problem, count: int) -> list[View]:
@@ -136,7 +136,7 @@ def _evenly(views: list[View], count: int) -> list[View]:
 
 
 def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
-    exposure = exposure_for(view.target)
+    exposure = exposure_for(view.target, view.weight)
     return ViewPictures(view.name, view.target, before, now, exposure, None, view.weight, view.is_test)
 
 

@@ -24,14 +24,18 @@ def uri(kind: str, data: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
-def common_exposure(targets: Sequence[Image]) -> float:
+def common_exposure(views: Iterable[tuple[Image, Image | None]]) -> float:
     """Return one display exposure for all views, at which 98 % of the target pixels are darker than white.
 
-    If there are many target pixels, a subset of them is used.
+    Each view is given as target and weights; pixels of weight zero are not counted. If there are many target pixels, a
+    subset of them is used.
     """
-    step = max(1, sum(target.shape[0] * target.shape[1] for target in targets) // MOST_LEVELS)
-    levels = [target[..., :3].max(axis=2).reshape(1, -1, 1)[:, ::step] for target in targets]
-    return exposure_for(np.concatenate(levels, axis=1)) if levels else 1.0
+    levels = [
+        target[..., :3].max(axis=2)[slice(None) if weight is None else weight[..., 0] > 0].reshape(1, -1, 1)
+        for target, weight in views
+    ]
+    step = max(1, sum(level.size for level in levels) // MOST_LEVELS)
+    return exposure_for(np.concatenate([level[:, ::step] for level in levels], axis=1)) if levels else 1.0
 
 
 def lead(config: Config, parameters: int, learned: int, test_views: int) -> tuple[str, str, str]:
@@ -59,7 +63,9 @@ def facts(config: Config, history: Sequence[Entry]) -> tuple[tuple[str, str], ..
             (f"{history[0].loss:.3g} → {history[-1].loss:.3g}", f"loss ({config.loss})"),
             (f"{seconds:.0f} s", f"{seconds / len(history):.2f} s per iteration"),
         ]
-    return (*figures, (f"{config.spp}", "samples per pixel and step"), (f"{config.seed}", "seed"))
+    spp = sorted({entry.spp for entry in history if entry.spp}) or [config.spp]
+    samples = f"{spp[0]}" if len(spp) == 1 else f"{spp[0]} to {spp[-1]}"
+    return (*figures, (samples, "samples per pixel and step"), (f"{config.seed}", "seed"))
 
 
 def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:

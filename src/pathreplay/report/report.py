@@ -79,7 +79,7 @@ def report_page(
     if why := outcome.run.optimiser.finished:
         ended = f"Terminated after {len(history)} of {config.iterations} iterations: {why}."
     test_views, count = len(outcome.test_views()), number_of(outcome.recovered) + len(outcome.poses)
-    exposure = common_exposure([view.target for view in outcome.views])
+    exposure = common_exposure((view.target, view.weight) for view in outcome.views)
     return Page(
         title=outcome.folder.name,
         lead=lead(config, count, len(outcome.views) - test_views, test_views),

@@ -103,7 +103,7 @@ def outcome_of(
             v.target,
             before[v.name],
             after[v.name],
-            exposure_for(v.target),
+            exposure_for(v.target, v.weight),
             baselines.get(v.name),
             v.weight,
             v.is_test,

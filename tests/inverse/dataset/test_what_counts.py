@@ -190,10 +190,12 @@ def test_flip_is_that_of_flip_evaluator_where_the_mask_is() -> None:
     assert Likeness.of(black, white, 1.0, flip=True).flip == pytest.approx(0.9674, abs=1e-3)
     assert Likeness.of(black[:, :, :1], white[:, :, :1], 1.0, flip=True).flip == pytest.approx(0.9674, abs=1e-3)
     assert Likeness.of(black, white, 1.0).flip is None
-    # 67 pixels per degree blur by more than this: a mask takes a part of the map, not of the pictures.
+    # 67 pixels per degree blur by more than this: what the mask hides would reach into what it shows.
     half = np.repeat([[2.0] * 4 + [0.0] * 4], 8, axis=0).astype(np.float32)[:, :, None]
     both = np.where(half > 0, black, white).astype(np.float32)
-    assert 0 < Likeness.of(both, black, 1.0, half, flip=True).flip < Likeness.of(both, black, 1.0, flip=True).flip
+    assert Likeness.of(both, black, 1.0, half, flip=True).flip == 0 < Likeness.of(both, black, 1.0, flip=True).flip
+    other = np.where(half > 0, white, black).astype(np.float32)
+    assert 0 < Likeness.of(other, black, 1.0, half, flip=True).flip < 2 * 0.9674
 
 
 def test_flip_is_left_out_where_the_package_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,8 +215,11 @@ def test_likeness_has_its_closed_forms() -> None:
     # Upside down, structure is opposed.
     assert Likeness.of(image, 1 - image, 1.0).ssim < 0
     half = np.where(np.arange(32) < 16, 2.0, 0.0).astype(np.float32)[None, :, None] * np.ones((24, 1, 1), np.float32)
-    other = np.where(half > 0, image, 0)
-    assert Likeness.of(image, other.astype(np.float32), 1.0, half).psnr == MOST_DB
+    other = np.where(half > 0, image, 0).astype(np.float32)
+    assert Likeness.of(image, other, 1.0, half) == Likeness(MOST_DB, pytest.approx(1))
+    one = Likeness.of(image, (other * 0.9).astype(np.float32), 1.0, half)
+    assert one == Likeness.of(image, np.where(half > 0, other * 0.9, 7).astype(np.float32), 1.0, half)
+    assert Likeness.of(image, image[::-1], 1.0, np.full_like(half, 1.0)) == Likeness.of(image, image[::-1], 1.0)
 
 
 def test_a_display_ends_at_white() -> None:

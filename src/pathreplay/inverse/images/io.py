@@ -307,9 +307,13 @@ def _colours(image: Image) -> Image:
     return image[:, :, : 1 if image.shape[2] < 3 else 3]
 
 
-def exposure_for(image: Image) -> float:
-    """Return the exposure at which 98 % of the pixels are below white (1 for a black image)."""
-    level = float(np.quantile(_colours(image).max(axis=2), 0.98))
+def exposure_for(image: Image, weight: Image | None = None) -> float:
+    """Return the exposure at which 98 % of the pixels are below white (1 for a black image).
+
+    Pixels of ``weight`` zero are not counted.
+    """
+    levels = _colours(image).max(axis=2)
+    level = float(np.quantile(levels if weight is None else levels[weight[:, :, 0] > 0], 0.98))
     return 1.0 / level if level > 0 else 1.0
 
 

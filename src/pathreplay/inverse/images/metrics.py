@@ -31,7 +31,8 @@ class Likeness:
     ) -> Likeness:
         """Compare an image with its target, as displayed (see `displayed`).
 
-        PSNR = -10 log10 (mean square error). SSIM is the mean over pixels and colour channels.
+        PSNR = -10 log10 (mean square error). SSIM is the mean over pixels and colour channels. The windows of SSIM
+        weight their pixels, too. Pixels of weight zero therefore do not affect the result.
 
         Args:
             image: rendered image, shape (height, width, channels).
@@ -42,12 +43,12 @@ class Likeness:
                 flip-evaluator. The FLIP value is None if the package is not installed.
         """
         a, b = (displayed(picture, exposure) for picture in (image, target))
-        w = np.ones((1, 1, 1)) if weight is None else weight.astype(np.float64)
+        w = np.ones((*a.shape[:2], 1)) if weight is None else weight.astype(np.float64)
         error = float(np.mean(w * (a - b) ** 2))
         psnr = MOST_DB if error <= 10 ** (-MOST_DB / 10) else -10 * float(np.log10(error))
-        flip_map = _flip(a, b) if flip else None
+        flip_map = _flip(np.where(w > 0, a, b), b) if flip else None
         perceived = None if flip_map is None else float(np.mean(w * flip_map))
-        return Likeness(psnr, float(np.mean(w * _similarity(a, b))), perceived)
+        return Likeness(psnr, float(np.mean(w * _similarity(a, b, w))), perceived)
 
 
 def has_flip() -> bool:
@@ -66,11 +67,17 @@ def _flip(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
     return np.asarray(flip_map, np.float64)
 
 
-def _similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Compute SSIM for each pixel and channel."""
+def _similarity(a: np.ndarray, b: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Compute SSIM for each pixel and channel. Pixels of the windows have weights ``w`` (height x width x 1)."""
+
+    def blurred(x: np.ndarray) -> np.ndarray:
+        return scipy.ndimage.gaussian_filter(x, (SIGMA, SIGMA, 0), truncate=CUT / SIGMA)
+
+    total = blurred(w)
+    per_weight = np.divide(1, total, where=total > 0, out=np.zeros_like(total))
 
     def mean(x: np.ndarray) -> np.ndarray:
-        return scipy.ndimage.gaussian_filter(x, (SIGMA, SIGMA, 0), truncate=CUT / SIGMA)
+        return blurred(w * x) * per_weight
 
     μ, ν = mean(a), mean(b)
     σ, τ, covariance = mean(a * a) - μ * μ, mean(b * b) - ν * ν, mean(a * b) - μ * ν
