@@ -62,6 +62,14 @@ def test_few_iterations_say_nothing() -> None:
     assert still_moves(history, "another") is None
 
 
+@pytest.mark.parametrize("steps", [24, 60])
+def test_values_that_swing_around_their_end_still_move(steps: int) -> None:
+    """Adam overshoots. The mean gradient of the last iterations is then far below their deviation."""
+    for seed in range(20):
+        history, _ = descended(seed, 3, 0.1, 0.01)
+        assert still_moves(history[:steps], "x") is True and still_moves(history, "x") is False
+
+
 def test_values_at_a_bound_do_not_move() -> None:
     history = [SimpleNamespace(slopes={"x": [1 + n % 2]}, means={"x": [0.0]}) for n in range(30)]
     assert still_moves(history, "x") is False
@@ -137,7 +145,7 @@ PAINT, LAMP, UNSEEN = "wall.bsdf.reflectance.value", "lamp.intensity.value", "be
 #: Keys, learning rate, and what is said.
 RUNS: dict[str, tuple[list[str], float, Verdict]] = {
     "converges": ([PAINT], 0.1, Verdict(arrived=(PAINT,))),
-    "still moves": ([PAINT], 0.002, Verdict(moving=(PAINT,))),
+    "still moves": ([PAINT], 0.001, Verdict(moving=(PAINT,))),
     "light x albedo": ([LAMP, PAINT], 0.1, Verdict(arrived=(LAMP, PAINT), trade_offs=((LAMP, PAINT),))),
     "unseen": ([PAINT, UNSEEN], 0.1, Verdict(arrived=(PAINT, UNSEEN), unseen=(UNSEEN,))),
 }
@@ -149,7 +157,7 @@ def test_a_run_says_what_came_of_its_values(case: str, tmp_path: Path, monkeypat
     Path("scene.xml").write_text(SCENE)
     keys, learning_rate, verdict = RUNS[case]
     job = {
-        "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 64}, "iterations": 60, "spp": 4,
+        "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 64}, "iterations": 180, "spp": 4,
         "eval_spp": 4, "integrator": {"type": "pathreplay", "max_depth": 2}, "loss": "relative-l2",
         "parameters": [
             {"key": key, "lower": 0, "initial": 0.2 if key == PAINT else 16 if key == LAMP else 0.5,

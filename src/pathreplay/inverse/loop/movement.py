@@ -1,9 +1,11 @@
 """Convergence test: whether the mean of the last gradients of a variable differs significantly from zero.
 
-The noise of gradients is independent between iterations. The standard error of the mean gradient over a window of n
-iterations is therefore the standard deviation of the gradients divided by √n. The expected gradient is zero at
-convergence and nonzero before convergence. This holds for any step size, so small steps are not mistaken for
-convergence.
+The noise of gradients is independent between iterations. Its standard deviation σ follows from the differences of
+successive gradients, in which slow changes of the expected gradient cancel. The standard error of the mean gradient
+over n iterations is σ / √n. The expected gradient is zero at convergence and nonzero before convergence. This holds for
+any step size, so small steps are not mistaken for convergence. An optimiser with momentum may overshoot. Its gradients
+then change their sign, and their mean over all iterations may be zero. The mean over each quarter is therefore tested
+as well.
 
 A variable also counts as converged if its gradient is small relative to the initial gradient. Near a minimum, the loss
 is quadratic, so the remaining distance is proportional to the gradient.
@@ -23,6 +25,8 @@ MOST_PARTS = 8
 """Largest number of parts of a variable over which gradients are summed for the test."""
 SHORTEST = 20
 """Smallest number of iterations that the test needs."""
+BLOCKS = (1, 4)
+"""Numbers of equal blocks of iterations over which gradients are averaged for the test."""
 LEFT = 0.01
 """Fraction of the initial gradient below which a variable counts as converged."""
 _FIRST = 5
@@ -47,11 +51,11 @@ def parts_of(array: Array, mean: bool = False) -> list[float]:
 def still_moves(history: Sequence[Entry], key: str, begin: int = 0) -> bool | None:
     """Test whether a variable still moves. Returns None if there are too few iterations since ``begin``.
 
-    Let g be the sum of the gradient over a part of the variable. The test statistic of the part is
-    t = √n mean(g) / std(g) over a window of n iterations: the last third, but at least `SHORTEST` iterations. If
-    gradients are pure noise, the mean of t² over m parts is about 1 ± √(2/m). The variable moves if this mean exceeds
-    1 + 7 √(2/m), and the gradient exceeds `LEFT` times the initial gradient. Parts that stay constant, e.g. at a bound,
-    are excluded.
+    Let g be the sum of the gradient over a part of the variable. The test statistic of the part is t = √n mean(g) / σ
+    over a block of n iterations, with 2σ² = mean((g_{i+1} - g_i)²). One block contains the last third of the iterations,
+    but at least `SHORTEST`, and further blocks divide it (see `BLOCKS`). If gradients are pure noise, the mean of t²
+    over m parts is about 1 ± √(2/m). The variable moves if this mean exceeds 1 + 7 √(2/m), and the gradient exceeds
+    `LEFT` times the initial gradient. Parts that stay constant, e.g. at a bound, are excluded.
     """
     since = history[begin:]
     window = [entry for entry in since[-max(len(since) // 3, SHORTEST) :] if key in entry.slopes]
@@ -62,8 +66,12 @@ def still_moves(history: Sequence[Entry], key: str, begin: int = 0) -> bool | No
     free = (np.ptp(x, axis=0) > 0) & (np.ptp(g, axis=0) > 0)
     if not free.any():
         return False
-    mean = g.mean(axis=0)
-    t = math.sqrt(len(g)) * mean[free] / g.std(axis=0, ddof=1)[free]
-    significant = np.mean(np.square(t)) > 1 + 7 * math.sqrt(2 / free.sum())
-    initial = np.mean([entry.slopes[key] for entry in first], axis=0)
-    return bool(significant and np.linalg.norm(mean[free]) > LEFT * np.linalg.norm(initial[free]))
+    g, initial = g[:, free], np.mean([entry.slopes[key] for entry in first], axis=0)[free]
+    σ = np.sqrt(np.mean(np.square(np.diff(g, axis=0)), axis=0) / 2)
+    for count in BLOCKS:
+        means = np.array([block.mean(axis=0) for block in np.array_split(g, count)])
+        t = math.sqrt(len(g) / count) * means / σ
+        size = math.sqrt(np.mean(np.sum(np.square(means), axis=1)))
+        if np.mean(np.square(t)) > 1 + 7 * math.sqrt(2 / free.sum()) and size > LEFT * np.linalg.norm(initial):
+            return True
+    return False
