@@ -94,6 +94,30 @@ def test_a_page_has_curves_of_both_and_pictures_that_can_be_wiped(tmp_path: Path
     assert document(page).count(b"data:image/png") == 2 * 3 + 2
 
 
+def test_errors_are_those_of_the_results(tmp_path: Path) -> None:
+    """The result may be a mean of iterates. A run that goes on has none yet."""
+    runs = [a_run(tmp_path / "a"), a_run(tmp_path / "b")]
+    table = {
+        TEXTURE: {"shape": [3], "rmse": 0.125},
+        "eye": {"pose": "rigid", "error": {"position": 2.0, "degrees": 3.0}},
+    }
+    (runs[0] / "parameters.json").write_text(json.dumps(table))
+    rows = {row.name: row.cells for row in compare.table(pasts(runs)).rows}
+    assert rows[f"error of {TEXTURE}"] == ("0.125", "0.5")
+    assert (rows["error of eye:position"], rows["error of eye:degrees"]) == (("2", ""), ("3", ""))
+
+
+def test_runs_with_different_targets_say_so(tmp_path: Path) -> None:
+    runs = [a_run(tmp_path / name) for name in "abc"]
+    assert compare.page(pasts(runs)).notices == ()
+    (runs[1] / "images/target-left.png").write_bytes(png((202, 0, 0)))  # noise of atomic sums
+    assert compare.page(pasts(runs)).notices == ()
+    for run, target in ((runs[1], png((180, 0, 0))), (runs[2], png((200, 0, 0), (20, 30)))):
+        (run / "images/target-right.png").write_bytes(target)
+    (notice,) = compare.page(pasts(runs)).notices
+    assert "different targets in right." in notice and notice.endswith("those of a.")
+
+
 def test_a_comparison_shows_parameters_that_the_last_stage_freezes(tmp_path: Path) -> None:
     runs = pasts([a_run(tmp_path / "a"), a_run(tmp_path / "b")])
     for run in runs:

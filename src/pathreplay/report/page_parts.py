@@ -63,8 +63,8 @@ def facts(config: Config, history: Sequence[Entry]) -> tuple[tuple[str, str], ..
             (f"{history[0].loss:.3g} → {history[-1].loss:.3g}", f"loss ({config.loss})"),
             (f"{seconds:.0f} s", f"{seconds / len(history):.2f} s per iteration"),
         ]
-    spp = sorted({entry.spp for entry in history if entry.spp}) or [config.spp]
-    samples = f"{spp[0]}" if len(spp) == 1 else f"{spp[0]} to {spp[-1]}"
+    spp = sorted({entry.spp for entry in history if entry.spp})
+    samples = " to ".join(str(n) for n in dict.fromkeys((spp[0], spp[-1]))) if spp else f"{config.spp}"
     return (*figures, (samples, "samples per pixel and step"), (f"{config.seed}", "seed"))
 
 

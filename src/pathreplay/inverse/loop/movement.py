@@ -52,10 +52,10 @@ def still_moves(history: Sequence[Entry], key: str, begin: int = 0) -> bool | No
     """Test whether a variable still moves. Returns None if there are too few iterations since ``begin``.
 
     Let g be the sum of the gradient over a part of the variable. The test statistic of the part is t = √n mean(g) / σ
-    over a block of n iterations, with 2σ² = mean((g_{i+1} - g_i)²). One block contains the last third of the iterations,
-    but at least `SHORTEST`, and further blocks divide it (see `BLOCKS`). If gradients are pure noise, the mean of t²
-    over m parts is about 1 ± √(2/m). The variable moves if this mean exceeds 1 + 7 √(2/m), and the gradient exceeds
-    `LEFT` times the initial gradient. Parts that stay constant, e.g. at a bound, are excluded.
+    over a block of n iterations, with 2σ² = mean((g_{i+1} - g_i)²). One block contains the last third of the
+    iterations, but at least `SHORTEST`, and further blocks divide it (see `BLOCKS`). If gradients are pure noise, the
+    mean of t² over m parts is about 1 ± √(2/m). The variable moves if this mean exceeds 1 + 7 √(2/m), and the gradient
+    exceeds `LEFT` times the initial gradient. Parts that stay constant, e.g. at a bound, are excluded.
     """
     since = history[begin:]
     window = [entry for entry in since[-max(len(since) // 3, SHORTEST) :] if key in entry.slopes]

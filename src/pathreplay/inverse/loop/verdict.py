@@ -43,7 +43,9 @@ class Verdict:
         if self.unseen:
             parts.append(f"not determined by the images, which they do not affect: {_listed(self.unseen)}")
         if self.moving:
-            parts.append(f"still moving: {_listed(self.moving)}: run more iterations, or raise learning_rate if they do not swing")
+            parts.append(
+                f"still moving: {_listed(self.moving)}: run more iterations, or raise learning_rate unless they swing"
+            )
         free = {key for pair in self.trade_offs for key in pair} | set(self.unseen)
         if arrived := [key for key in self.arrived if key not in free]:
             which = _listed(arrived) if parts else "all"

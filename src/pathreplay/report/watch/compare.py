@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import PIL.Image
@@ -20,6 +20,9 @@ from pathreplay.report.pages.page import Head, Page, Parameter, Picture, Plot, R
 from pathreplay.report.report import MOST_PIXELS, MOST_VIEWS
 from pathreplay.report.watch.past import Past
 from pathreplay.report.watch.run_files import read_own
+
+SAME = 2
+"""Largest difference between images in [0, 255] that rounding errors cause."""
 
 
 def table(runs: list[Past]) -> Table:
@@ -37,20 +40,24 @@ def table(runs: list[Past]) -> Table:
             cells = tuple(_mean([run.likeness(view, kind) for view in views(run)], unit) for run in runs)
             if any(cells):
                 rows.append(Row(f"{kind.upper()}, {name}", cells))
-    for key in _keys(run.history[-1].errors if run.history else {} for run in runs):
-        rows.append(Row(f"error of {key}", tuple(_number(_last(run).get(key)) for run in runs)))
+    for key in _keys(run.errors for run in runs):
+        rows.append(Row(f"error of {key}", tuple(_number(run.errors.get(key)) for run in runs)))
     return Table((Head(""), *(Head(run.name) for run in runs)), (*rows, *_differences(runs)))
 
 
 def page(runs: list[Past]) -> Page:
     """Return a page with the table, curves, and images of the views that all runs have."""
     kinds = {run.config.loss for run in runs}
-    notice = "" if len(kinds) == 1 else f"The runs minimize different losses ({', '.join(sorted(kinds))})."
+    notices = [] if len(kinds) == 1 else [f"The runs minimize different losses ({', '.join(sorted(kinds))})."]
     views = _views(runs)
+    if other := _with_other_targets(runs, [view.name for view in views]):
+        notices.append(
+            f"The runs have different targets in {', '.join(other)}. The targets shown are those of {runs[0].name}."
+        )
     return Page(
         title=" and ".join(run.name for run in runs) if len(runs) < 4 else f"{len(runs)} runs",
         lead=(f"{len(runs)} runs side by side: ", ", ".join(run.config.scene for run in runs[:1]), ""),
-        notices=(notice,) if notice else (),
+        notices=tuple(notices),
         views=views,
         likeness=table(runs),
         likeness_note="PSNR and SSIM are means over views, each at its own exposure, including render noise.",
@@ -79,10 +86,6 @@ def _mean(values: list[float | None], unit: str) -> str:
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.4g}"
-
-
-def _last(run: Past) -> Mapping[str, float]:
-    return run.history[-1].errors if run.history else {}
 
 
 def _keys(tables: Iterable[Iterable[str]]) -> list[str]:
@@ -158,6 +161,22 @@ def _views(runs: list[Past]) -> tuple[View, ...]:
     return tuple(sections)
 
 
+def _with_other_targets(runs: list[Past], views: list[str]) -> list[str]:
+    """Return the views whose targets look different between runs, in pixels or in exposure."""
+
+    def differ(name: str) -> bool:
+        first, *others = (_pixels(run, f"target-{name}") for run in runs)
+        return any(found.shape != first.shape or np.abs(found - first).max() > SAME for found in others)
+
+    return [name for name in views if differ(name)]
+
+
+def _pixels(run: Past, file: str) -> np.ndarray:
+    """Return the values of an image of a run, in [0, 255]; without pixels if the image does not exist."""
+    picture = _opened(run, file)
+    return np.zeros((0, 0, 0)) if picture is None else np.asarray(picture.convert("RGB"), np.float64)
+
+
 def _parameters(runs: list[Past]) -> tuple[Parameter, ...]:
     names_of = [file_names(_keys(entry.gradient_norms for entry in run.history)) for run in runs]
     sections = []
@@ -177,24 +196,32 @@ def _parameters(runs: list[Past]) -> tuple[Parameter, ...]:
 
 def _picture(run: Past, kind: str, caption: str, file: str, most_pixels: float) -> Picture | None:
     """Read an image of a run, and reduce it to ``most_pixels``; None if the image does not exist."""
-    data = read_own(run.folder / "images" / f"{file}.png")
+    picture = _opened(run, file)
+    if picture is None:
+        return None
+    factor = (most_pixels / (picture.width * picture.height)) ** 0.5
+    if factor < 1:
+        picture = picture.convert("RGB").resize(
+            (max(1, round(picture.width * factor)), max(1, round(picture.height * factor))),
+            PIL.Image.Resampling.BOX,
+        )
+    buffer = io.BytesIO()
+    picture.save(buffer, "png")
+    return Picture(kind, caption, uri("image/png", buffer.getvalue()))
+
+
+def _opened(run: Past, file: str) -> PIL.Image.Image | None:
+    """Read an image of a run; None if it does not exist."""
+    path = run.folder / "images" / f"{file}.png"
+    data = read_own(path)
     if data is None:
         return None
     try:
-        with PIL.Image.open(io.BytesIO(data), formats=("PNG",)) as picture:
-            factor = (most_pixels / (picture.width * picture.height)) ** 0.5
-            if factor < 1:
-                small = picture.convert("RGB").resize(
-                    (max(1, round(picture.width * factor)), max(1, round(picture.height * factor))),
-                    PIL.Image.Resampling.BOX,
-                )
-                buffer = io.BytesIO()
-                small.save(buffer, "png")
-                data = buffer.getvalue()
+        picture = PIL.Image.open(io.BytesIO(data), formats=("PNG",))
+        picture.load()
     except (OSError, ValueError, PIL.Image.DecompressionBombError) as error:
-        path = run.folder / "images" / f"{file}.png"
         raise PathreplayError(f"Image {path} cannot be read ({error}); give the folder of a complete run") from None
-    return Picture(kind, caption, uri("image/png", data))
+    return picture
 
 
 def print_table(it: Table) -> None:

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.loop.checkpoint import HISTORY, Entry, history_of
+from pathreplay.inverse.parameters.pose import error_names
 from pathreplay.report.watch.run_files import read_own
 from pathreplay.runs.run_folder import CHECKPOINT, read_job
 from pathreplay.types import Json
@@ -52,6 +53,23 @@ class Past:
         """The entries of views.json by view name. The dictionary is empty before the end of the run."""
         table = self._json("views.json")
         return table if all(isinstance(view, dict) for view in table.values()) else {}
+
+    @cached_property
+    def errors(self) -> dict[str, float]:
+        """Errors of the result by name, as in `Entry.errors`. Before the end of the run, those of the last iteration.
+
+        The result may be an average of iterates (see `Run.best`), and its errors then differ from those of an iterate.
+        """
+        found = dict(self.history[-1].errors) if self.history else {}
+        for key, entry in self._json("parameters.json").items():
+            if not isinstance(entry, dict):
+                continue
+            if isinstance(entry.get("rmse"), (int, float)):
+                found[key] = float(entry["rmse"])
+            if isinstance(pose := entry.get("error"), dict):
+                for name, value in zip(error_names(key), (pose.get("position"), pose.get("degrees")), strict=True):
+                    found |= {name: float(value)} if isinstance(value, (int, float)) else {}
+        return found
 
     def likeness(self, view: str, kind: str) -> float | None:
         """Return an image metric ('psnr' or 'ssim') of the result of a view; None if unknown."""
