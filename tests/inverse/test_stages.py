@@ -197,7 +197,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"test_views": ["right"], "stages": [{"iterations": 1, "sensors": ["right"]}]},
         "sensor 'right' is a test view; name training views: left",
     ),
-    "no key": ({"stages": [{"iterations": 1, "parameters": ["flor.*"]}]}, "No parameter 'flor.*'"),
+    "no key": (
+        {"stages": [{"iterations": 1, "parameters": ["flor.*"]}]},
+        "no parameter of the job matches 'flor.*'; name some of its parameters (",
+    ),
     "never": ({"stages": [{"iterations": 1, "parameters": [FLOOR]}]}, f"stages: no stage optimises '{TEXTURE}'"),
     "resolutions": (
         {"parameters": [{"key": TEXTURE, "resolutions": [2, 4]}]},

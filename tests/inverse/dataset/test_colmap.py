@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from pathreplay.errors import PathreplayError
@@ -124,6 +125,16 @@ def test_a_job_takes_pictures_and_masks_of_a_model(folder: Path) -> None:
             assert view.target.shape == (16, 24, 3) and view.weight is not None
             assert view.weight[8, 8] > 1 and view.weight[8, 20] == 0
         assert any("images undistorted to a pinhole camera" in note for note in problem.notes)
+
+
+def test_opaque_pictures_that_are_undistorted_are_not_called_transparent(folder: Path) -> None:
+    """The border that undistortion leaves empty does not count, so that it is not compared with black."""
+    for name in PIXELS:
+        PIL.Image.new("RGBA", (WIDTH, HEIGHT), (255, 255, 255, 255)).save(folder / "images" / name)
+    job = {"scene": "room.xml", "capture": {"colmap": "sparse/0", "images": "images", "width": 24}}
+    problem = build_problem(make_config({**job, "parameters": [{"key": "wall.bsdf.reflectance.value"}]}), folder)
+    assert any("undistorted" in note for note in problem.notes)
+    assert not any("transparent" in note for note in problem.notes)
 
 
 def patched(name: str, at: int, layout: str, *values: Any) -> Callable[[Path], None]:

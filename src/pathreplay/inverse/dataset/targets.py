@@ -172,6 +172,7 @@ def read_targets(
         _require_alpha(what, image, alpha, name, shape)
         # Premultiply before resampling, since the colours of transparent pixels are arbitrary.
         image = over_black(image, path)
+        fraction = transparent_share(image)  # of the photograph: undistortion adds an empty border
         if name in lenses:
             image, valid = lenses[name].undone(image)
             if not valid.any():
@@ -189,7 +190,6 @@ def read_targets(
         targets[name] = disk.keep(adapted_image(what, image, f"sensor '{name}' renders", shape[2]))
         if name in weights:
             weights[name] = disk.keep(weights[name])
-        fraction = transparent_share(image)
         if fraction and shape[2] in (1, 3) and alpha == "black":
             notes.append(
                 f"target image '{file}' is transparent in {fraction:.1%} of its pixels, which are compared with black; "
