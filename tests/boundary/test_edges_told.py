@@ -137,6 +137,22 @@ def test_a_script_is_told_of_the_tables_of_roughplastic(log: Any) -> None:
     assert len([line for line in log.lines if "gradient of a roughplastic's alpha or eta" in line]) == 1
 
 
+GLOSS = {"type": "principled", "metallic": 1.0, "sheen": 0.0, "clearcoat": 0.2}
+
+
+def test_a_script_is_told_of_lobes_that_are_absent(log: Any) -> None:
+    """Each parameter where it has gradients, and once."""
+    scene = make_scene(cube={"type": "cube", "bsdf": GLOSS}, ball={"type": "sphere", "bsdf": {"type": "principled"}})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    told = ["metallic = 1", "sheen = 0"]
+    for name, count in {"base_color": 0, "clearcoat": 0, "metallic": 1, "sheen": 2}.items():
+        for _ in range(2):
+            with attached(scene, f"cube.bsdf.{name}.value"):
+                dr.backward(dr.mean(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=1), axis=None))
+        lines = [line for line in log.lines if "leaves out a lobe" in line]
+        assert len(lines) == count and all(value in line for value, line in zip(told, lines, strict=False))
+
+
 XML = """<scene version="3.0.0">
   <sensor type="perspective" id="cam"><transform name="to_world"><translate z="-4"/></transform>
     <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/>

@@ -80,6 +80,12 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
             "the gradient of a roughplastic's alpha or eta is incomplete, and that of eta may have the wrong sign, "
             "because Mitsuba does not differentiate the tables that it computes from them; see docs/gradients.md"
         )
+    for value in traits.absent_lobes:
+        yield (
+            f"{value} leaves out a lobe, whose derivative is missing from the gradient: keep "
+            "the value a little inside of its range (0.01 or 0.99, also as 'lower' or 'upper' of a job); see "
+            "docs/gradients.md"
+        )
     if traits.skies_move and trace.attach != "none":
         yield (
             "a sunsky has gradients, whose part of the sky is wrong, because its samples move with the sun; use attach "

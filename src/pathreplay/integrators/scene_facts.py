@@ -9,6 +9,7 @@ import numpy as np
 
 from pathreplay.integrators.lifetimes import SCENES, is_recording
 from pathreplay.platform import compat
+from pathreplay.transport.facts.absent_lobes import AbsentLobes
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of, plain_numbers, with_gradients
 from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
@@ -57,6 +58,7 @@ class SceneFacts:
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
         self._bounded = any(shape.is_medium_transition() for shape in self._shapes)
         self._bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
+        self._absent_lobes = AbsentLobes(self._bsdfs)
         self._with_constants = [
             node for node in nodes if isinstance(node, _kinds_with_constants()) and plain_numbers(node)
         ]
@@ -78,6 +80,10 @@ class SceneFacts:
         if self._seams is None and not is_recording():
             self._seams = has_seams(self._textures)
         return self._seams is not False
+
+    def absent_lobes(self) -> tuple[str, ...]:
+        """Return the parameters without derivatives of a lobe (see `AbsentLobes`). Empty in a recording."""
+        return () if is_recording() else self._absent_lobes.find()
 
     def media(self, sensor: mi.Sensor | None, branches: bool | None = None) -> Media | None:
         """Return the current media of the scene. ``sensor`` may be inside a medium."""
@@ -108,6 +114,7 @@ class SceneFacts:
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
             opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
             tables_move=any(with_gradients(plastic, "alpha", "eta") for plastic in self._plastics),
+            absent_lobes=self.absent_lobes(),
             skies_move=any(with_gradients(light) for light in self._lights if light.class_name() == SUNSKY),
             lights_vary=any(map(with_gradients, self._emitters)),
         )
