@@ -153,6 +153,17 @@ def test_a_script_is_told_of_lobes_that_are_absent(log: Any) -> None:
         assert len(lines) == count and all(value in line for value, line in zip(told, lines, strict=False))
 
 
+def test_a_script_is_told_of_the_normals_of_curves(log: Any, tmp_path: Path) -> None:
+    (tmp_path / "tube.txt").write_text("\n".join(f"{x / 2} {(x % 3) / 4} 0 0.2" for x in range(5)))
+    tube = {"type": "bsplinecurve", "filename": str(tmp_path / "tube.txt")}
+    scene = make_scene(tube=tube, cube={"type": "cube", "bsdf": {"type": "diffuse"}})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    for key, count in (("cube.bsdf.reflectance.value", 0), ("tube.control_points", 1)):
+        with attached(scene, key):
+            dr.backward(dr.mean(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=1), axis=None))
+        assert len([line for line in log.lines if "derivative of their normals" in line]) == count
+
+
 XML = """<scene version="3.0.0">
   <sensor type="perspective" id="cam"><transform name="to_world"><translate z="-4"/></transform>
     <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/>

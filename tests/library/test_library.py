@@ -678,6 +678,8 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
              views=View(0, np.zeros((16, 16, 3)), weight=np.eye(16))),
          "returns one number, but masks or weights of pixels need a tensor of shape \\(16, 16, 3\\)"),
         (bad(integrator={"type": "path"}), "computes no gradients"),
+        (bad(integrator={"type": "aov", "aovs": "d:depth", "inner": {"type": "pathreplay"}}), "without 'aov' around"),
+        (bad(scene={"type": "scene", "x": {"type": "bitmap", "data": mi.TensorXf()}}), "has moved the tensors"),
         (bad(spp=0), "problem: 'spp' is 0"),
         (bad(parameters={WALL: Parameter(bounds=(1, 0))}), "is not above lower bound"),
         (bad(parameters={WALL: Parameter(bounds=1)}), r"'wall.*': bounds are 1; give \(lower, upper\)"),

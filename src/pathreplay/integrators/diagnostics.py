@@ -86,6 +86,11 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
             "the value a little inside of its range (0.01 or 0.99, also as 'lower' or 'upper' of a job); see "
             "docs/gradients.md"
         )
+    if traits.splines_move and trace.attach != "none":
+        yield (
+            "control points of a bsplinecurve have gradients: where curves bend, the derivative of their shading is "
+            "wrong, because Mitsuba's derivative of their normals is; see docs/boundary.md"
+        )
     if traits.skies_move and trace.attach != "none":
         yield (
             "a sunsky has gradients, whose part of the sky is wrong, because its samples move with the sun; use attach "

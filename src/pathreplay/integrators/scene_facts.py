@@ -53,6 +53,7 @@ class SceneFacts:
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
         self._masks = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == MASK]
         self._plastics = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == PLASTIC]
+        self._splines = [s for s in self._shapes if s.shape_type() == mi.ShapeType.BSplineCurve]
         self._textures = [node for node in nodes if isinstance(node, mi.Texture)]
         self._seams: bool | None = None
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
@@ -115,6 +116,7 @@ class SceneFacts:
             opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
             tables_move=any(with_gradients(plastic, "alpha", "eta") for plastic in self._plastics),
             absent_lobes=self.absent_lobes(),
+            splines_move=any(with_gradients(curve, "control_points") for curve in self._splines),
             skies_move=any(with_gradients(light) for light in self._lights if light.class_name() == SUNSKY),
             lights_vary=any(map(with_gradients, self._emitters)),
         )

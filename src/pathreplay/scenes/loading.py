@@ -12,6 +12,7 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.platform import memory
@@ -82,11 +83,17 @@ def _copied(description: Mapping[str, object]) -> SceneDict:
     """Copy a dictionary, its tensors and its bitmaps.
 
     When Mitsuba loads a dictionary, it moves the tensors out of it, and converts bitmaps in place in spectral variants.
+    Raises PathreplayError for a dictionary that Mitsuba has loaded before, if tensors are missing from it.
     """
 
     def copied(value: object) -> object:
         if isinstance(value, Mapping):
             return _copied(value)
+        if dr.is_tensor_v(value) and 0 in np.shape(value):
+            raise PathreplayError(
+                "The scene's dictionary contains an empty tensor; if mi.load_dict has loaded the dictionary before, it "
+                "has moved the tensors into that scene: give the scene, or build the dictionary again"
+            )
         return type(value)(value) if dr.is_array_v(value) or isinstance(value, mi.Bitmap) else value
 
     return {name: copied(value) for name, value in description.items()}

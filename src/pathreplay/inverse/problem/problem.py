@@ -463,7 +463,10 @@ def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
 
 def _require_gradients(integrator: mi.Integrator, name: str) -> None:
     if not isinstance(integrator, mi.CppADIntegrator):
-        raise PathreplayError(f"Integrator '{name}' computes no gradients; use 'pathreplay' or another AD integrator")
+        within = ", without 'aov' around it" if name == "aov" else ""
+        raise PathreplayError(
+            f"Integrator '{name}' computes no gradients; use 'pathreplay' or another AD integrator{within}"
+        )
 
 
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
