@@ -17,7 +17,7 @@ import pytest
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.images.io import read_image
+from pathreplay.inverse.images.io import exr_bytes, read_image
 from pathreplay.inverse.loop import loop
 from pathreplay.jobs import optimize
 from pathreplay.platform.atomic_files import Content, chunks
@@ -105,6 +105,25 @@ def test_stopped_and_resumed_equals_uninterrupted(monkeypatch: pytest.MonkeyPatc
     assert [e.loss for e in resumed.history] == pytest.approx([e.loss for e in whole.history], rel=1e-4)
     with pytest.raises(PathreplayError, match="has all its 6 iterations"):
         optimize(resume=stopped.folder, progress=False)
+
+
+def test_a_run_does_not_go_on_from_other_initial_values(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are in the report, and regularizers refer to them."""
+    with monkeypatch.context() as patch:
+        interrupt_at(3, patch)
+        stopped = run(parameters=[{"key": TEXTURE}, {"key": "floor.reflectance.*", "initial": 0.5}])
+    config, texture = stopped.folder / "config.json", room / "texture.exr"
+    plain = config.read_text(), texture.read_bytes()
+    for key in ("floor.reflectance.value", TEXTURE):
+        if key == TEXTURE:
+            texture.write_bytes(exr_bytes(1 - read_image(texture)))
+        else:
+            config.write_text(plain[0].replace("0.5", "0.9"))
+        with pytest.raises(PathreplayError, match=f"The initial value of '{key}' is not that with which the run"):
+            optimize(resume=stopped.folder, progress=False)
+        config.write_text(plain[0])
+        texture.write_bytes(plain[1])
+    assert optimize(resume=stopped.folder, progress=False).iterations == 6
 
 
 def test_second_ctrl_c_aborts_and_the_checkpoint_stays(monkeypatch: pytest.MonkeyPatch) -> None:

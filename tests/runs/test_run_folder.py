@@ -356,7 +356,7 @@ def test_the_history_is_in_no_header_but_older_checkpoints_are_read(finished: Pa
     path = run / CHECKPOINT
     with safetensors.safe_open(str(path), framework="numpy") as file:
         metadata, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
-    assert metadata.keys() == {"steps"}
+    assert metadata.keys() == {"steps", "starts"}
     history = arrays.pop("history").tobytes().decode()
     arrays.pop(SEAL)
     path.write_bytes(b"".join(sealed_chunks(arrays, {**metadata, "history": history})))

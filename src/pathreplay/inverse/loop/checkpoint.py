@@ -67,6 +67,8 @@ class Run:
     learned: Arrays = field(default_factory=dict)
     """Arrays, by name, that the integrator passes on to later evaluations, such as the control variates of media."""
     history: list[Entry] = field(default_factory=list)
+    starts: dict[str, list[float]] = field(default_factory=dict)
+    """`summary` of the initial value of each variable, by key."""
     baseline: Run | None = None
     """A run of another integrator for comparison, with the same initial values and the same computation time."""
     whole: bool = True
@@ -82,11 +84,18 @@ class Run:
 
 _HISTORY = TypeAdapter(list[Entry])
 _STEPS = TypeAdapter(dict[str, NonNegativeInt])
+_STARTS = TypeAdapter(dict[str, list[FiniteFloat]])
 
 _VALUE, _LEARNED = "value:", "learned:"
 HISTORY = "history"
 """Name of the tensor with the history: the bytes of a JSON text. Headers of safetensors files have a limit of 100 MB,
 which the history of a long run with many variables exceeds."""
+
+
+def summary(array: Array) -> list[float]:
+    """Return the means of up to eight contiguous parts of an array, and its root mean square."""
+    flat = np.ravel(array).astype(np.float64)
+    return [*(float(part.mean()) for part in np.array_split(flat, 8) if part.size), float(np.sqrt(np.mean(flat**2)))]
 
 
 def save(run: Run) -> Content:
@@ -97,7 +106,7 @@ def save(run: Run) -> Content:
         **{_VALUE + key: value for key, value in run.values.items()},
     }
     plain[HISTORY] = _bytes_of(json.dumps([asdict(entry) for entry in run.history]))
-    metadata = {"steps": json.dumps(state.steps)}
+    metadata = {"steps": json.dumps(state.steps), "starts": json.dumps(run.starts)}
     arrays = {name: partial(group.__getitem__, name) for group in (plain, state.arrays) for name in group}
     return partial(sealed_chunks, WhenAsked(arrays), metadata)
 
@@ -132,11 +141,11 @@ def restore(path: Path, run: Run, variables: Sequence[Variable], held: Collectio
         held: keys of variables that are frozen in some stages.
 
     Raises:
-        PathreplayError: the file is damaged or invalid, or belongs to other variables.
+        PathreplayError: the file is damaged or invalid, or belongs to other variables or other initial values.
     """
     try:
         levels = {v.key: v.levels for v in variables}
-        values, state, history, learned = _read(path, run.values, levels, held)
+        values, state, history, learned = _read(path, run, levels, held)
         try:
             run.optimiser.restore(state, latents(variables, values))
         except (KeyError, ValueError) as error:
@@ -155,9 +164,10 @@ def restore(path: Path, run: Run, variables: Sequence[Variable], held: Collectio
 
 
 def _read(
-    path: Path, values: Arrays, levels: Mapping[str, Levels | None], held: Collection[str]
+    path: Path, run: Run, levels: Mapping[str, Levels | None], held: Collection[str]
 ) -> tuple[dict[str, Array], State, list[Entry], Arrays]:
     """Read values, optimiser state, history and learned statistics. `restore` translates the errors raised here."""
+    values = run.values
     if not path.is_file():
         raise ValueError("no such file")
     with safetensors.safe_open(str(path), framework="numpy") as file:
@@ -171,6 +181,13 @@ def _read(
             f"Checkpoint {path} has the parameters {', '.join(steps)}, but the config names {', '.join(values)}; "
             "start a new run"
         )
+    for key, start in _STARTS.validate_json(metadata.get("starts", "{}"), strict=True).items():
+        now = run.starts.get(key, start)
+        if len(now) != len(start) or not np.allclose(now, start, rtol=1e-4, atol=1e-5 * start[-1]):
+            raise PathreplayError(
+                f"The initial value of '{key}' is not that with which the run of {path} was started; restore it in the "
+                "config, scene or file that gives it, or start a new run"
+            )
     for index, entry in enumerate(history):
         if entry.iteration != index:
             raise ValueError(f"entry {index} of its history has the iteration {entry.iteration}")
