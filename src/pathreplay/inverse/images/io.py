@@ -107,13 +107,14 @@ def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
     """Return the bitmap of a file, and a function that orients and scales the decoded pixels."""
     with path.open("rb") as file:
         magic = file.read(2)
-        if magic in (b"P5", b"P6"):
-            return _pixmap(file, pixmap_head(magic + file.read(MOST_HEAD))), lambda image: image
         if magic == b"#?":
             return _radiance(file, radiance_head(magic + file.read(MOST_HEAD)))
-        if magic == b"BM" and (colours := _from_palette(path)) is not None:
-            return colours, lambda image: image
-    return mi.Bitmap(str(path)), lambda image: image
+        bitmap = None
+        if magic in (b"P5", b"P6"):
+            bitmap = _pixmap(file, pixmap_head(magic + file.read(MOST_HEAD)))
+        elif magic == b"BM":
+            bitmap = _from_palette(path)
+    return mi.Bitmap(str(path)) if bitmap is None else bitmap, lambda image: image
 
 
 def _from_palette(path: Path) -> mi.Bitmap | None:
