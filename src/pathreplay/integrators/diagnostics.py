@@ -83,8 +83,7 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
     for value in traits.absent_lobes:
         yield (
             f"{value} leaves out a lobe, whose derivative is missing from the gradient: keep "
-            "the value a little inside of its range (0.01 or 0.99, also as 'lower' or 'upper' of a job); see "
-            "docs/gradients.md"
+            "the value 0.001 inside of its range, as 'Problem' and jobs do; see docs/gradients.md"
         )
     if traits.splines_move and trace.attach != "none":
         yield (

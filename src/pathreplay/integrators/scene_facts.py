@@ -9,7 +9,7 @@ import numpy as np
 
 from pathreplay.integrators.lifetimes import SCENES, is_recording
 from pathreplay.platform import compat
-from pathreplay.transport.facts.absent_lobes import AbsentLobes
+from pathreplay.transport.facts.absent_lobes import AbsentLobes, ranges_of
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of, plain_numbers, with_gradients
 from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
@@ -85,6 +85,10 @@ class SceneFacts:
     def absent_lobes(self) -> tuple[str, ...]:
         """Return the parameters without derivatives of a lobe (see `AbsentLobes`). Empty in a recording."""
         return () if is_recording() else self._absent_lobes.find()
+
+    def ranges(self) -> dict[mi.Object, tuple[float, float]]:
+        """Return bounds that keep parameters of BSDFs away from values at which a lobe is absent (see `ranges_of`)."""
+        return ranges_of(self._bsdfs)
 
     def media(self, sensor: mi.Sensor | None, branches: bool | None = None) -> Media | None:
         """Return the current media of the scene. ``sensor`` may be inside a medium."""

@@ -45,8 +45,8 @@ def scaled(image: np.ndarray, target: np.ndarray, weight: np.ndarray | float) ->
 
 def structural(image: np.ndarray, target: np.ndarray, weight: np.ndarray | float) -> float:
     """By the SSIM that reports have, which is another code (SciPy's windows)."""
-    a, b = (encoded(x) for x in (image, target))
-    return float((weight * (1 - _similarity(a.astype(float), b.astype(float)))).mean())
+    a, b = (encoded(x).astype(float) for x in (image, target))
+    return float((weight * (1 - _similarity(a, b, np.ones((*a.shape[:2], 1))))).mean())
 
 
 EXPECTED: dict[str, Callable[..., float]] = {"scale-invariant": scaled, "ssim": structural}

@@ -117,7 +117,8 @@ class Parameter(Table):
     key: str
     """Key of mitsuba.traverse(scene), or a glob such as '*.reflectance.value'."""
     lower: Finite | None = None
-    """Lower bound, enforced by projection after each step."""
+    """Lower bound, enforced by projection after each step. If a BSDF omits a lobe at a value at the end of its range,
+    for example at metallic = 1 of 'principled', values stay 0.001 inside of the range."""
     upper: Finite | None = None
     """Upper bound, enforced by projection after each step."""
     learning_rate: Positive | None = None

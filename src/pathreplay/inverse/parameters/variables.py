@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
+from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.inverse.config.parameter_options import Derivation, Displacement, Parameter, TransportStart
 from pathreplay.inverse.config.user_functions import Modules
 from pathreplay.inverse.parameters import limits as parameter_limits
@@ -177,6 +178,7 @@ def make_variables(
     """
     variables: list[Variable] = []
     poses: list[Pose] = []
+    ranges = facts_of(scene).ranges()
     for key, entry in keys.items():
         rate = entry.learning_rate
         assert rate is not None  # `Config.completed_entry` fills in a missing rate
@@ -186,6 +188,9 @@ def make_variables(
             like = seen(params, key) if entry.shape is None else _numbers(key, entry.shape)
             start = _start(key, like, form, entry, base, starts.get(entry.key))
             bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
+            if entry.shape is None and entry.parameterization is None and key.endswith((".value", ".data")):
+                bounds = _within(bounds, ranges.get(params.properties[key][2]))
+                start = np.clip(start, np.float32(bounds[0]), np.float32(bounds[1]))
             levels = _levels(key, entry, entry.refine_at or [], start)
             coordinates = _coordinates(params, key, entry, start, levels, form.wraps)
             if entry.parameterization is None:
@@ -214,6 +219,12 @@ def make_variables(
             bounded(name, rate, start)
             variables.append(Variable(name, mi.Vector3f(0), (-np.inf, np.inf), rate, start, None))
     return variables, poses
+
+
+def _within(bounds: tuple[float, float], lobes: tuple[float, float] | None) -> tuple[float, float]:
+    """Return ``bounds`` within ``lobes`` (see `SceneFacts.ranges`), or ``bounds`` if nothing would be left."""
+    lower, upper = bounds if lobes is None else (max(bounds[0], lobes[0]), min(bounds[1], lobes[1]))
+    return (lower, upper) if lower < upper else bounds
 
 
 def _coordinates(

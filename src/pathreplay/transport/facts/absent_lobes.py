@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.transport.facts.nodes import with_gradients
+from pathreplay.transport.facts.nodes import children_of, with_gradients
 
 ENDS: dict[str, dict[str, tuple[float, ...]]] = {
     "MaskBSDF": {"opacity": (0, 1)},
@@ -20,7 +20,23 @@ ENDS: dict[str, dict[str, tuple[float, ...]]] = {
     "Principled": {"metallic": (1,), "spec_trans": (0, 1), "clearcoat": (0,), "sheen": (0,)},
     "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2), "sheen": (0,)},
 }
-"""Values at which a lobe is absent, by class of the BSDF and parameter."""
+"""Values at which a lobe is absent, by class of the BSDF and parameter. Zero is the lower end of a range."""
+INSIDE = 1e-3
+"""Distance from an end that `ranges_of` keeps. A lobe is sampled with a probability of about this distance, so that the
+noise of the gradient grows as the distance becomes smaller."""
+
+
+def ranges_of(bsdfs: Iterable[mi.BSDF]) -> dict[mi.Object, tuple[float, float]]:
+    """Return the lower and upper bounds of parameters that exclude `ENDS`, by the texture that has the values."""
+    ranges = {}
+    for bsdf in bsdfs:
+        if (ends_of := ENDS.get(bsdf.class_name())) is None:
+            continue
+        for name, texture in children_of(bsdf).items():
+            ends = ends_of.get(name, ())
+            highest = min((end - INSIDE for end in ends if end > 0), default=np.inf)
+            ranges[texture] = INSIDE if 0 in ends else -np.inf, highest
+    return ranges
 
 
 class AbsentLobes:

@@ -54,6 +54,11 @@ def is_mesh(shape: mi.Shape) -> TypeIs[mi.Mesh]:
     return shape.is_mesh()
 
 
+def children_of(node: mi.Object) -> dict[str, mi.Object]:
+    """Return the child objects of a node by name."""
+    return dict(_contents(node)[0])
+
+
 def nodes_of(root: mi.Object) -> set[mi.Object]:
     """Find all objects reachable from ``root``, a scene or one of its objects."""
     seen: set[mi.Object] = set()
