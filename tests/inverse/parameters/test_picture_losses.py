@@ -45,7 +45,7 @@ def scaled(image: np.ndarray, target: np.ndarray, weight: np.ndarray | float) ->
 
 def structural(image: np.ndarray, target: np.ndarray, weight: np.ndarray | float) -> float:
     """By the SSIM that reports have, which is another code (SciPy's windows)."""
-    a, b = (encoded(x).astype(float) for x in (image, target))
+    a, b = (encoded(x).astype(float) for x in (np.where(np.asarray(weight) > 0, image, target), target))
     return float((weight * (1 - _similarity(a, b, np.ones((*a.shape[:2], 1))))).mean())
 
 
@@ -87,6 +87,15 @@ def test_a_loss_and_its_gradient_follow_the_formula(name: str, shape: tuple[int,
         h = 1e-3
         slope = (formula(image + h * direction) - formula(image - h * direction)) / (2 * h)
         assert np.vdot(gradient, direction) == pytest.approx(slope, rel=5e-3, abs=2e-6)
+
+
+def test_hidden_pixels_do_not_reach_into_visible_ones() -> None:
+    image, target = pictures((9, 7, 3))
+    weight = np.where(np.arange(7) < 4, 7 / 4, 0.0)[None, :, None] * np.ones((9, 1, 1))
+    value, gradient = value_and_gradient("ssim", image, target, weight)
+    other = value_and_gradient("ssim", np.where(weight > 0, image, 5 * image), target, weight)
+    assert value == other[0] > 0 and (gradient == other[1]).all()
+    assert (gradient[:, 4:] == 0).all() and (gradient[:, :4] != 0).all()
 
 
 @pytest.mark.slow

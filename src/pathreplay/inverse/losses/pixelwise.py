@@ -83,6 +83,9 @@ QUADRATIC = frozenset({l2, relative_l2, display_l2})
 #: Losses that take the pixel weights of `mean_loss` as a third argument.
 WEIGHTED = frozenset({scale_invariant})
 
+#: Losses that compare each pixel together with its neighbours.
+WITH_NEIGHBOURS = frozenset({ssim, lpips})
+
 #: Losses that Dr.Jit cannot record, because another framework computes them.
 ELSEWHERE = frozenset({lpips})
 
@@ -107,7 +110,8 @@ def mean_loss(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weight: mi.Te
         loss: the loss function.
         image: rendered image, shape (height, width, channels).
         target: target image, of the same shape.
-        weight: weights of the pixels with mean 1, shape (height, width, 1); None weights all equally.
+        weight: weights of the pixels with mean 1, shape (height, width, 1); None weights all equally. Where the weight
+            is zero, losses in `WITH_NEIGHBOURS` use the target in place of the image.
 
     Returns:
         A tensor with one entry.
@@ -115,6 +119,8 @@ def mean_loss(loss: Loss, image: mi.TensorXf, target: mi.TensorXf, weight: mi.Te
     Raises:
         PathreplayError: the loss function returns one number, which cannot be weighted by pixels.
     """
+    if weight is not None and loss in WITH_NEIGHBOURS:
+        image = dr.select(weight > 0, image, target)
     values = loss(image, target, weight) if loss in WEIGHTED else loss(image, target)
     if weight is not None and values.shape in ((), (1,)):
         raise PathreplayError(
