@@ -153,6 +153,16 @@ def test_a_script_is_told_of_lobes_that_are_absent(log: Any) -> None:
         assert len(lines) == count and all(value in line for value, line in zip(told, lines, strict=False))
 
 
+@pytest.mark.parametrize(("colour", "count"), [((0.6, 0.0, 0.0), 0), ((0.0, 0.0, 0.0), 1)])
+def test_plastic_leaves_out_a_lobe_whose_whole_colour_is_black(colour: tuple[float, ...], count: int, log: Any) -> None:
+    bsdf = {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": colour}}
+    scene = make_scene(cube={"type": "cube", "bsdf": bsdf})
+    with attached(scene, "cube.bsdf.diffuse_reflectance.value"):
+        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+        dr.backward(dr.mean(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=1), axis=None))
+    assert len([line for line in log.lines if "diffuse_reflectance = 0 of" in line]) == count
+
+
 def test_a_script_is_told_of_the_normals_of_curves(log: Any, tmp_path: Path) -> None:
     (tmp_path / "tube.txt").write_text("\n".join(f"{x / 2} {(x % 3) / 4} 0 0.2" for x in range(5)))
     tube = {"type": "bsplinecurve", "filename": str(tmp_path / "tube.txt")}

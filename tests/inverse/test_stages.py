@@ -199,7 +199,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "no key": (
         {"stages": [{"iterations": 1, "parameters": ["flor.*"]}]},
-        "no parameter of the job matches 'flor.*'; name some of its parameters (",
+        "No parameter 'flor.*' in the job",
     ),
     "never": ({"stages": [{"iterations": 1, "parameters": [FLOOR]}]}, f"stages: no stage optimises '{TEXTURE}'"),
     "resolutions": (

@@ -119,7 +119,7 @@ def test_a_run_does_not_go_on_from_other_initial_values(room: Path, monkeypatch:
             texture.write_bytes(exr_bytes(1 - read_image(texture)))
         else:
             config.write_text(plain[0].replace("0.5", "0.9"))
-        with pytest.raises(PathreplayError, match=f"The initial value of '{key}' is not that with which the run"):
+        with pytest.raises(PathreplayError, match=f"The initial value of '{key}' differs from the one at the start"):
             optimize(resume=stopped.folder, progress=False)
         config.write_text(plain[0])
         texture.write_bytes(plain[1])

@@ -637,6 +637,14 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
     return make
 
 
+def loaded_before() -> dict[str, Any]:
+    """A description whose tensor is in another scene by now."""
+    texture = {"type": "bitmap", "data": mi.TensorXf(np.full((2, 2, 3), 0.5, np.float32)), "raw": True}
+    description = {**room(), "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": texture}}}
+    mi.load_dict(description)
+    return description
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -679,7 +687,8 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
          "returns one number, but masks or weights of pixels need a tensor of shape \\(16, 16, 3\\)"),
         (bad(integrator={"type": "path"}), "computes no gradients"),
         (bad(integrator={"type": "aov", "aovs": "d:depth", "inner": {"type": "pathreplay"}}), "without 'aov' around"),
-        (bad(scene={"type": "scene", "x": {"type": "bitmap", "data": mi.TensorXf()}}), "has moved the tensors"),
+        (bad(integrator=mi.load_dict({"type": "aov", "aovs": "d:depth", "inner": {"type": "path"}})), "without 'aov'"),
+        (lambda photos: Problem(loaded_before(), {WALL: GREY}, views(photos)), "has moved the tensors"),
         (bad(spp=0), "problem: 'spp' is 0"),
         (bad(parameters={WALL: Parameter(bounds=(1, 0))}), "is not above lower bound"),
         (bad(parameters={WALL: Parameter(bounds=1)}), r"'wall.*': bounds are 1; give \(lower, upper\)"),

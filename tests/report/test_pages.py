@@ -17,7 +17,7 @@ import pytest
 
 from page_samples import HOSTILE, sample
 from pathreplay.inverse.config.schema import make_config
-from pathreplay.inverse.images.io import exposure_for
+from pathreplay.inverse.images.io import exposure_for, levels
 from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.report.drawing import own_settings
 from pathreplay.report.outcome import Recovered, ViewPictures
@@ -103,7 +103,7 @@ def test_one_exposure_is_that_of_all_pixels_together() -> None:
 def test_pixels_that_do_not_count_set_no_exposure() -> None:
     target, weight = np.full((4, 4, 3), 0.5, np.float32), np.full((4, 4, 1), 2.0, np.float32)
     target[:2], weight[:2] = 9.0, 0.0
-    assert common_exposure([(target, weight)]) == exposure_for(target, weight) == pytest.approx(2)
+    assert common_exposure([(target, weight)]) == exposure_for(levels(target, weight)) == pytest.approx(2)
     assert common_exposure([(target, None)]) == pytest.approx(1 / 9)
 
 

@@ -156,8 +156,9 @@ def test_a_run_says_what_came_of_its_values(case: str, tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)
     Path("scene.xml").write_text(SCENE)
     keys, learning_rate, verdict = RUNS[case]
+    moves = bool(verdict.moving)
     job = {
-        "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 64}, "iterations": 180, "spp": 4,
+        "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 64}, "iterations": 60 if moves else 180, "spp": 4,
         "eval_spp": 4, "integrator": {"type": "pathreplay", "max_depth": 2}, "loss": "relative-l2",
         "parameters": [
             {"key": key, "lower": 0, "initial": 0.2 if key == PAINT else 16 if key == LAMP else 0.5,

@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from page_samples import HOSTILE
 from pathreplay.cli import app
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.inverse.loop.checkpoint import _HISTORY, Entry
 from pathreplay.jobs import make_config, optimize
 from pathreplay.report.live_page import FOLDER
@@ -109,13 +110,17 @@ def test_errors_are_those_of_the_results(tmp_path: Path) -> None:
 
 def test_runs_with_different_targets_say_so(tmp_path: Path) -> None:
     runs = [a_run(tmp_path / name) for name in "abc"]
-    assert compare.page(pasts(runs)).notices == ()
-    (runs[1] / "images/target-left.png").write_bytes(png((202, 0, 0)))  # noise of atomic sums
-    assert compare.page(pasts(runs)).notices == ()
-    for run, target in ((runs[1], png((180, 0, 0))), (runs[2], png((200, 0, 0), (20, 30)))):
-        (run / "images/target-right.png").write_bytes(target)
+    assert compare.page(pasts(runs)).notices == ()  # without targets
+    image = np.random.default_rng(0).uniform(0.1, 1, (3, 4, 3)).astype(np.float32)
+    scales = {"left": (1, 1 + 1e-6, 1), "right": (1, 2, 1)}  # sums in another order; twice as bright
+    for view, factors in scales.items():
+        for run, factor in zip(runs, factors, strict=True):
+            (run / f"images/target-{view}.exr").write_bytes(exr_bytes(np.float32(factor) * image))
     (notice,) = compare.page(pasts(runs)).notices
     assert "different targets in right." in notice and notice.endswith("those of a.")
+    for run in runs:
+        (run / "images/target-right.png").unlink()
+    assert compare.page(pasts(runs)).notices == (notice,)
 
 
 def test_a_comparison_shows_parameters_that_the_last_stage_freezes(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import mitsuba as mi
 from pathreplay.boundary.observer import omitted_distance
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.edge_notes import edges_note, keys_that_move_edges
+from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.platform import compat
 from pathreplay.transport.vertex import TraceConfig
 
@@ -80,7 +81,7 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
             "the gradient of a roughplastic's alpha or eta is incomplete, and that of eta may have the wrong sign, "
             "because Mitsuba does not differentiate the tables that it computes from them; see docs/gradients.md"
         )
-    for value in traits.absent_lobes:
+    for value in facts_of(trace.scene).absent_lobes():
         yield (
             f"{value} leaves out a lobe, whose derivative is missing from the gradient: keep "
             "the value 0.001 inside of its range, as 'Problem' and jobs do; see docs/gradients.md"
@@ -88,7 +89,7 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
     if traits.splines_move and trace.attach != "none":
         yield (
             "control points of a bsplinecurve have gradients: where curves bend, the derivative of their shading is "
-            "wrong, because Mitsuba's derivative of their normals is; see docs/boundary.md"
+            "wrong, because Mitsuba's derivative of their normals is wrong; see docs/boundary.md"
         )
     if traits.skies_move and trace.attach != "none":
         yield (

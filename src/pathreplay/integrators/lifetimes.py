@@ -193,7 +193,7 @@ def _hide_garbage() -> None:
     """Hide all objects from the collector, unless other code has hidden any. See `_on_collection`.
 
     Hiding takes constant time. Counting takes time for each hidden object. Objects that other code has hidden are
-    therefore counted only once between full collections.
+    therefore counted only once between full collections, and count as hidden until the next one.
     """
     global _hidden, _hidden_by_others
     if not _hidden and not _hidden_by_others:

@@ -83,7 +83,7 @@ class SceneFacts:
         return self._seams is not False
 
     def absent_lobes(self) -> tuple[str, ...]:
-        """Return the parameters without derivatives of a lobe (see `AbsentLobes`). Empty in a recording."""
+        """Return the parameters that lack the derivative of a lobe (see `AbsentLobes`). Empty in a recording."""
         return () if is_recording() else self._absent_lobes.find()
 
     def ranges(self) -> dict[mi.Object, tuple[float, float]]:
@@ -119,7 +119,6 @@ class SceneFacts:
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
             opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
             tables_move=any(with_gradients(plastic, "alpha", "eta") for plastic in self._plastics),
-            absent_lobes=self.absent_lobes(),
             splines_move=any(with_gradients(curve, "control_points") for curve in self._splines),
             skies_move=any(with_gradients(light) for light in self._lights if light.class_name() == SUNSKY),
             lights_vary=any(map(with_gradients, self._emitters)),

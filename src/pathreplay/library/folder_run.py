@@ -6,10 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.images.io import Image
+from pathreplay.inverse.images.io import Image, alike
 from pathreplay.inverse.loop.checkpoint import Run
 from pathreplay.inverse.loop.events import Event
 from pathreplay.inverse.loop.loop import ended, render_views
@@ -110,22 +108,12 @@ def with_saved_targets(folder: Path, problem: Problem) -> Problem:
     saved = saved_targets(folder)
     for view in problem.views:
         pairs = (saved.images.get(view.name), view.target), (saved.weights.get(view.name), view.weight)
-        if not all(_same(*pair) for pair in pairs):
+        if not all(alike(*pair) for pair in pairs):
             raise PathreplayError(
                 f"Run {folder} has another target or weight of view '{view.name}' than the problem; use the original "
                 "targets, or start a new run"
             )
     return problem.with_targets(saved)
-
-
-def _same(saved: Image | None, given: Image | None) -> bool:
-    """Return whether two images are equal up to rounding. None equals only None."""
-    if saved is None or given is None:
-        return saved is given
-    if saved.shape != given.shape:
-        return False
-    largest = float(np.abs(saved).max(initial=1))
-    return np.allclose(given, saved, rtol=1e-4, atol=1e-5 * largest)
 
 
 def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolder, dict[str, Image]]:

@@ -128,9 +128,12 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
 def require_same(original: mi.Scene, folder: Path) -> None:
     """Raise PathreplayError unless the exported scene has the parameter values of the original, up to rounding."""
     gc.collect()
-    remedy = "if a value is out of its range, give the parameter bounds ('lower', 'upper')"
-    with errors_as(f"The exported scene cannot be loaded ({remedy})"), spare_thread():
-        copy = mi.load_file(str(folder / SCENE), optimize=False)
+    try:
+        with errors_as("The exported scene cannot be loaded"), spare_thread():
+            copy = mi.load_file(str(folder / SCENE), optimize=False)
+    except PathreplayError as error:
+        remedy = "if a value is outside of its range, give the parameter 'lower' and 'upper'"
+        raise PathreplayError(f"{error}; {remedy}") from None
     ours, theirs = traversed(original), traversed(copy)
     # Match objects without id by their order, which is the same in both scenes.
     waiting: defaultdict[str, list[str]] = defaultdict(list)

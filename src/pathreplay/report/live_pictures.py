@@ -11,7 +11,7 @@ import PIL.Image
 
 from pathreplay.errors import plain_line
 from pathreplay.inverse.dataset.views import View
-from pathreplay.inverse.images.io import Image, displayed, exposure_for
+from pathreplay.inverse.images.io import Image, displayed, exposure_for, levels
 from pathreplay.inverse.images.metrics import Likeness
 from pathreplay.inverse.loop.checkpoint import Run
 from pathreplay.inverse.loop.events import Event, Stepped
@@ -119,7 +119,7 @@ class LivePictures:
 
     def stored(self, view: View) -> float:
         """Return the exposure at which images of a view are encoded."""
-        return min(self.exposure, exposure_for(view.target, view.weight))
+        return min(self.exposure, exposure_for(levels(view.target, view.weight)))
 
 
 def _chosen(problem: Problem, count: int) -> list[View]:
@@ -136,7 +136,7 @@ def _evenly(views: list[View], count: int) -> list[View]:
 
 
 def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
-    exposure = exposure_for(view.target, view.weight)
+    exposure = exposure_for(levels(view.target, view.weight))
     return ViewPictures(view.name, view.target, before, now, exposure, None, view.weight, view.is_test)
 
 

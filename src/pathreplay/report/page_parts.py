@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from pathreplay.inverse.config.schema import Config
-from pathreplay.inverse.images.io import Image, encoded, exposure_for
+from pathreplay.inverse.images.io import Image, encoded, exposure_for, levels
 from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.report.outcome import Recovered, RecoveredPose
 from pathreplay.report.pages.page import Plot, Row, Series, thinned
@@ -30,12 +30,9 @@ def common_exposure(views: Iterable[tuple[Image, Image | None]]) -> float:
     Each view is given as target and weights; pixels of weight zero are not counted. If there are many target pixels, a
     subset of them is used.
     """
-    levels = [
-        target[..., :3].max(axis=2)[slice(None) if weight is None else weight[..., 0] > 0].reshape(1, -1, 1)
-        for target, weight in views
-    ]
-    step = max(1, sum(level.size for level in levels) // MOST_LEVELS)
-    return exposure_for(np.concatenate([level[:, ::step] for level in levels], axis=1)) if levels else 1.0
+    parts = [levels(target, weight) for target, weight in views]
+    step = max(1, sum(part.size for part in parts) // MOST_LEVELS)
+    return exposure_for(np.concatenate([part[::step] for part in parts])) if parts else 1.0
 
 
 def lead(config: Config, parameters: int, learned: int, test_views: int) -> tuple[str, str, str]:
@@ -64,7 +61,7 @@ def facts(config: Config, history: Sequence[Entry]) -> tuple[tuple[str, str], ..
             (f"{seconds:.0f} s", f"{seconds / len(history):.2f} s per iteration"),
         ]
     spp = sorted({entry.spp for entry in history if entry.spp})
-    samples = " to ".join(str(n) for n in dict.fromkeys((spp[0], spp[-1]))) if spp else f"{config.spp}"
+    samples = f"{spp[0]} to {spp[-1]}" if len(spp) > 1 else f"{spp[0] if spp else config.spp}"
     return (*figures, (samples, "samples per pixel and step"), (f"{config.seed}", "seed"))
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pathreplay.inverse.images.io import Image, exposure_for, exr_bytes, png_bytes
+from pathreplay.inverse.images.io import Image, exposure_for, exr_bytes, levels, png_bytes
 from pathreplay.inverse.images.metrics import Likeness
 from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.verdict import Verdict
@@ -103,7 +103,7 @@ def outcome_of(
             v.target,
             before[v.name],
             after[v.name],
-            exposure_for(v.target, v.weight),
+            exposure_for(levels(v.target, v.weight)),
             baselines.get(v.name),
             v.weight,
             v.is_test,

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.platform import memory
@@ -89,7 +88,7 @@ def _copied(description: Mapping[str, object]) -> SceneDict:
     def copied(value: object) -> object:
         if isinstance(value, Mapping):
             return _copied(value)
-        if dr.is_tensor_v(value) and 0 in np.shape(value):
+        if dr.is_tensor_v(value) and len(value.array) == 0:
             raise PathreplayError(
                 "The scene's dictionary contains an empty tensor; if mi.load_dict has loaded the dictionary before, it "
                 "has moved the tensors into that scene: give the scene, or build the dictionary again"

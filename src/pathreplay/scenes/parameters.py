@@ -51,12 +51,13 @@ _WAY_OUT = {
 }
 
 
-def resolve_keys(params: Mapping[str, object], patterns: str | Iterable[str]) -> list[str]:
+def resolve_keys(params: Mapping[str, object], patterns: str | Iterable[str], owner: str = "the scene") -> list[str]:
     """Return the keys that match ``patterns``, without duplicates, in the order of the patterns.
 
     A pattern is an exact key or a shell-style glob (``*``, ``?``, ``[abc]``). The keys that match one glob are in the
     order of the scene. Globs match whole keys, including dots. Names may contain brackets: if a glob matches nothing,
-    its brackets are treated as literal characters. ``params`` is the result of ``mi.traverse(scene)``.
+    its brackets are treated as literal characters. ``params`` is the result of ``mi.traverse(scene)``, or another
+    dictionary by key, which messages call ``owner``.
 
     Raises PathreplayError, which lists the nearest keys, if a pattern matches nothing.
     """
@@ -67,7 +68,7 @@ def resolve_keys(params: Mapping[str, object], patterns: str | Iterable[str]) ->
         literal = pattern.replace("[", "[[]")
         matches = [pattern] if pattern in known else fnmatch.filter(known, pattern) or fnmatch.filter(known, literal)
         if not matches:
-            raise PathreplayError(_no_match(known, pattern))
+            raise PathreplayError(_no_match(known, pattern, owner))
         selected.update(dict.fromkeys(matches))
     return list(selected)
 
@@ -77,16 +78,17 @@ def keep_only(params: mi.SceneParameters, keys: Iterable[str]) -> None:
     params.keep([rf"{re.escape(key)}\Z" for key in keys])
 
 
-def _no_match(known: list[str], pattern: str) -> str:
+def _no_match(known: list[str], pattern: str, owner: str) -> str:
     if not known:
-        return f"No parameter '{pattern}': the scene has no parameters"
+        return f"No parameter '{pattern}': {owner} has no parameters"
     # Keys are compared in lower case, so that a wrong capital letter does not matter. With a cutoff of 0.5, 'red.bsdf'
     # is similar to 'red.bsdf.reflectance.value'.
     lower = {key.lower(): key for key in known}
     close = [lower[match] for match in difflib.get_close_matches(pattern.lower(), lower, n=3, cutoff=0.5)]
     if close:
-        return f"No parameter '{pattern}' in the scene; nearest: {', '.join(close)}"
-    return f"No parameter '{pattern}' in the scene, and no similar one; mitsuba.traverse(scene) lists all {len(known)}"
+        return f"No parameter '{pattern}' in {owner}; nearest: {', '.join(close)}"
+    where = "mitsuba.traverse(scene)" if owner == "the scene" else owner
+    return f"No parameter '{pattern}' in {owner}, and no similar one; {where} lists all {len(known)}"
 
 
 def owner_class(params: mi.SceneParameters, key: str) -> str:
@@ -103,7 +105,7 @@ def require_differentiable(params: mi.SceneParameters, key: str, integrator: mi.
     ``mi.ParamFlags.NonDifferentiable`` (see `carries_derivative`). The message names a remedy if there is one.
     """
     if key not in params:
-        raise PathreplayError(_no_match(list(params.keys()), key))
+        raise PathreplayError(_no_match(list(params.keys()), key, "the scene"))
     if carries_derivative(params, key, integrator):
         return
     value = params[key]

@@ -15,7 +15,7 @@ import pytest
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.dataset.globbing import matching
 from pathreplay.inverse.dataset.views import sensors_of, shares_of
-from pathreplay.inverse.images.io import encoded, exposure_for, exr_bytes, over_black, png_bytes, read_image
+from pathreplay.inverse.images.io import encoded, exposure_for, exr_bytes, levels, over_black, png_bytes, read_image
 from pathreplay.inverse.problem.problem import InMemory, Problem, build_problem
 from pathreplay.jobs import make_config
 from pathreplay.platform.threads import spare_thread
@@ -227,7 +227,8 @@ def test_grey_is_not_alpha(folder: Path) -> None:
 
 def test_alpha_does_not_set_the_exposure() -> None:
     grey = np.full((HEIGHT, WIDTH, 1), 0.01, np.float32)
-    assert exposure_for(np.concatenate([grey, np.ones_like(grey)], axis=2)) == exposure_for(grey) == pytest.approx(100)
+    with_alpha = np.concatenate([grey, np.ones_like(grey)], axis=2)
+    assert exposure_for(levels(with_alpha)) == exposure_for(levels(grey)) == pytest.approx(100)
 
 
 def test_what_alpha_cannot_be_is_refused_in_one_line(folder: Path) -> None:

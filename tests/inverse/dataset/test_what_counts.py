@@ -194,8 +194,9 @@ def test_flip_is_that_of_flip_evaluator_where_the_mask_is() -> None:
     half = np.repeat([[2.0] * 4 + [0.0] * 4], 8, axis=0).astype(np.float32)[:, :, None]
     both = np.where(half > 0, black, white).astype(np.float32)
     assert Likeness.of(both, black, 1.0, half, flip=True).flip == 0 < Likeness.of(both, black, 1.0, flip=True).flip
-    other = np.where(half > 0, white, black).astype(np.float32)
-    assert 0 < Likeness.of(other, black, 1.0, half, flip=True).flip < 2 * 0.9674
+    one, other = (np.where(half > 0, white, hidden).astype(np.float32) for hidden in (black, white))
+    masked, whole = (Likeness.of(one, black, 1.0, weight, flip=True).flip for weight in (half, None))
+    assert masked == Likeness.of(other, black, 1.0, half, flip=True).flip > whole > 0
 
 
 def test_flip_is_left_out_where_the_package_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 import pathreplay
 from pathreplay import Parameter, Problem, View
+from pathreplay.integrators.scene_facts import facts_of
 from variant import VARIANT
 
 KEY = "ball.bsdf.{}.value"
@@ -61,3 +62,12 @@ def test_other_ends_and_bounds_stay() -> None:
     assert start("metallic", 0, (0, 1)) == 0 and start("flatness", 1, (0, 1)) == 1
     assert start("metallic", 1, (0, 1)) == np.float32(0.999)
     assert start("metallic", 1, (0.9995, 1)) == 1  # nothing else is allowed
+
+
+def test_a_texture_with_several_uses_keeps_to_all_of_its_ranges() -> None:
+    mi.set_variant(VARIANT)
+    grey = mi.load_dict({"type": "uniform", "value": 0.5})
+    scene = ball({"type": "principled", "metallic": grey, "clearcoat": grey, "roughness": grey}, "sheen", 0.5)
+    ranges = facts_of(scene).ranges()
+    assert ranges[grey] == (0.001, 0.999) and len(ranges) == 3
+    assert facts_of(ball({"type": "plastic", "diffuse_reflectance": grey}, "specular_reflectance", 0)).ranges() == {}

@@ -172,7 +172,8 @@ def read_targets(
         _require_alpha(what, image, alpha, name, shape)
         # Premultiply before resampling, since the colours of transparent pixels are arbitrary.
         image = over_black(image, path)
-        fraction = transparent_share(image)  # of the photograph: undistortion adds an empty border
+        # Undistortion adds an empty border, which is not part of the photograph.
+        fraction = transparent_share(image) if alpha == "black" and shape[2] in (1, 3) else 0.0
         if name in lenses:
             image, valid = lenses[name].undone(image)
             if not valid.any():
@@ -190,7 +191,7 @@ def read_targets(
         targets[name] = disk.keep(adapted_image(what, image, f"sensor '{name}' renders", shape[2]))
         if name in weights:
             weights[name] = disk.keep(weights[name])
-        if fraction and shape[2] in (1, 3) and alpha == "black":
+        if fraction:
             notes.append(
                 f"target image '{file}' is transparent in {fraction:.1%} of its pixels, which are compared with black; "
                 "if the background of your scene is not black, use alpha = 'scene' to composite over it, or 'mask'"

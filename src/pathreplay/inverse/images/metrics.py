@@ -32,7 +32,8 @@ class Likeness:
         """Compare an image with its target, as displayed (see `displayed`).
 
         PSNR = -10 log10 (mean square error). SSIM is the mean over pixels and colour channels. The windows of SSIM
-        weight their pixels, too. Pixels of weight zero therefore do not affect the result.
+        weight their pixels, too, so that pixels of weight zero do not affect PSNR and SSIM. FLIP takes the values of
+        the target there.
 
         Args:
             image: rendered image, shape (height, width, channels).

@@ -68,7 +68,7 @@ class Run:
     """Arrays, by name, that the integrator passes on to later evaluations, such as the control variates of media."""
     history: list[Entry] = field(default_factory=list)
     starts: dict[str, list[float]] = field(default_factory=dict)
-    """`summary` of the initial value of each variable, by key."""
+    """Means over parts of each initial value (`movement.parts_of`), and its root mean square, by key."""
     baseline: Run | None = None
     """A run of another integrator for comparison, with the same initial values and the same computation time."""
     whole: bool = True
@@ -90,12 +90,6 @@ _VALUE, _LEARNED = "value:", "learned:"
 HISTORY = "history"
 """Name of the tensor with the history: the bytes of a JSON text. Headers of safetensors files have a limit of 100 MB,
 which the history of a long run with many variables exceeds."""
-
-
-def summary(array: Array) -> list[float]:
-    """Return the means of up to eight contiguous parts of an array, and its root mean square."""
-    flat = np.ravel(array).astype(np.float64)
-    return [*(float(part.mean()) for part in np.array_split(flat, 8) if part.size), float(np.sqrt(np.mean(flat**2)))]
 
 
 def save(run: Run) -> Content:
@@ -181,12 +175,13 @@ def _read(
             f"Checkpoint {path} has the parameters {', '.join(steps)}, but the config names {', '.join(values)}; "
             "start a new run"
         )
-    for key, start in _STARTS.validate_json(metadata.get("starts", "{}"), strict=True).items():
-        now = run.starts.get(key, start)
-        if len(now) != len(start) or not np.allclose(now, start, rtol=1e-4, atol=1e-5 * start[-1]):
+    starts = _STARTS.validate_json(metadata.get("starts", "{}"), strict=True)
+    for key, now in run.starts.items():
+        start = starts.get(key, now)
+        if len(now) != len(start) or not np.allclose(now, start, rtol=1e-4, atol=1e-5 * now[-1]):
             raise PathreplayError(
-                f"The initial value of '{key}' is not that with which the run of {path} was started; restore it in the "
-                "config, scene or file that gives it, or start a new run"
+                f"The initial value of '{key}' differs from the one at the start of the run {path.parent}; restore it "
+                "in the config, scene or file that gives it, or start a new run"
             )
     for index, entry in enumerate(history):
         if entry.iteration != index:

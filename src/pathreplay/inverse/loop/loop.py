@@ -19,7 +19,7 @@ from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.loop import noise
 from pathreplay.inverse.loop.batches import batch
-from pathreplay.inverse.loop.checkpoint import Entry, Run, summary
+from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.events import (
     Entered,
     Event,
@@ -92,7 +92,10 @@ def new_run(
         executor or Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
         optimiser_of(problem, values, optimizer or Optimizer()),
         values,
-        starts={v.key: summary(v.start) for v in problem.variables},
+        starts={
+            v.key: [*parts_of(v.start, mean=True), float(np.linalg.norm(v.start) / max(1, v.start.size) ** 0.5)]
+            for v in problem.variables
+        },
     )
 
 

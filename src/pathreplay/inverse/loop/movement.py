@@ -1,11 +1,11 @@
 """Convergence test: whether the mean of the last gradients of a variable differs significantly from zero.
 
-The noise of gradients is independent between iterations. Its standard deviation σ follows from the differences of
-successive gradients, in which slow changes of the expected gradient cancel. The standard error of the mean gradient
-over n iterations is σ / √n. The expected gradient is zero at convergence and nonzero before convergence. This holds for
-any step size, so small steps are not mistaken for convergence. An optimiser with momentum may overshoot. Its gradients
-then change their sign, and their mean over all iterations may be zero. The mean over each quarter is therefore tested
-as well.
+The noise of gradients is independent between iterations. Its standard deviation σ is estimated from the
+differences of successive gradients, in which slow changes of the expected gradient cancel. The standard error of the
+mean gradient over n iterations is σ / √n. The expected gradient is zero at convergence and nonzero before convergence.
+This holds for any step size, so small steps are not mistaken for convergence. An optimiser with momentum may overshoot.
+Its gradients then change their sign, and their mean over all iterations may be zero. The means over quarters of the
+iterations are therefore tested as well.
 
 A variable also counts as converged if its gradient is small relative to the initial gradient. Near a minimum, the loss
 is quadratic, so the remaining distance is proportional to the gradient.
@@ -54,8 +54,9 @@ def still_moves(history: Sequence[Entry], key: str, begin: int = 0) -> bool | No
     Let g be the sum of the gradient over a part of the variable. The test statistic of the part is t = √n mean(g) / σ
     over a block of n iterations, with 2σ² = mean((g_{i+1} - g_i)²). One block contains the last third of the
     iterations, but at least `SHORTEST`, and further blocks divide it (see `BLOCKS`). If gradients are pure noise, the
-    mean of t² over m parts is about 1 ± √(2/m). The variable moves if this mean exceeds 1 + 7 √(2/m), and the gradient
-    exceeds `LEFT` times the initial gradient. Parts that stay constant, e.g. at a bound, are excluded.
+    mean of t² over m parts of one block is about 1 ± √(2/m). The variable moves if the mean of t² over all parts and
+    blocks of equal length exceeds 1 + 7 √(2/m), and the gradient exceeds `LEFT` times the initial gradient. Parts that
+    stay constant, e.g. at a bound, are excluded.
     """
     since = history[begin:]
     window = [entry for entry in since[-max(len(since) // 3, SHORTEST) :] if key in entry.slopes]

@@ -43,7 +43,7 @@ class Verdict:
         if self.unseen:
             parts.append(f"not determined by the images, which they do not affect: {_listed(self.unseen)}")
         if self.moving:
-            remedy = "run more iterations, or raise learning_rate unless they swing"
+            remedy = "run more iterations, or raise learning_rate if they do not oscillate"
             parts.append(f"still moving: {_listed(self.moving)}: {remedy}")
         free = {key for pair in self.trade_offs for key in pair} | set(self.unseen)
         if arrived := [key for key in self.arrived if key not in free]:

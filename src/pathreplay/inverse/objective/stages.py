@@ -88,15 +88,10 @@ def _moving(problem: Problem, stage: Stage) -> list[str]:
         for part in each.of:
             owners[part].add(each.key)
     known = dict.fromkeys(name for names in owners.values() for name in names)
-    named: set[str] = set()
-    for pattern in stage.parameters:
-        try:
-            named.update(parameters.resolve_keys(known, pattern))
-        except PathreplayError:
-            some = ", ".join([*known][:8]) + (", ..." if len(known) > 8 else "")
-            raise PathreplayError(
-                f"stages: no parameter of the job matches {shown(pattern)}; name some of its parameters ({some})"
-            ) from None
+    try:
+        named = parameters.resolve_keys(known, stage.parameters, "the job")
+    except PathreplayError as error:
+        raise PathreplayError(f"stages: {error}; name parameters that the job recovers") from None
     return [key for key in keys if not owners[key].isdisjoint(named)]
 
 

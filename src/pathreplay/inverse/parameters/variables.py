@@ -189,8 +189,9 @@ def make_variables(
             start = _start(key, like, form, entry, base, starts.get(entry.key))
             bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
             if entry.shape is None and entry.parameterization is None and key.endswith((".value", ".data")):
-                bounds = _within(bounds, ranges.get(params.properties[key][2]))
-                start = np.clip(start, np.float32(bounds[0]), np.float32(bounds[1]))
+                if (lobes := ranges.get(params.properties[key][2])) is not None:
+                    bounds = _within(bounds, lobes)
+                    start = np.clip(start, np.float32(bounds[0]), np.float32(bounds[1]))
             levels = _levels(key, entry, entry.refine_at or [], start)
             coordinates = _coordinates(params, key, entry, start, levels, form.wraps)
             if entry.parameterization is None:
@@ -221,9 +222,9 @@ def make_variables(
     return variables, poses
 
 
-def _within(bounds: tuple[float, float], lobes: tuple[float, float] | None) -> tuple[float, float]:
+def _within(bounds: tuple[float, float], lobes: tuple[float, float]) -> tuple[float, float]:
     """Return ``bounds`` within ``lobes`` (see `SceneFacts.ranges`), or ``bounds`` if nothing would be left."""
-    lower, upper = bounds if lobes is None else (max(bounds[0], lobes[0]), min(bounds[1], lobes[1]))
+    lower, upper = max(bounds[0], lobes[0]), min(bounds[1], lobes[1])
     return (lower, upper) if lower < upper else bounds
 
 

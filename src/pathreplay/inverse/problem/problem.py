@@ -285,7 +285,7 @@ def build_problem(
     if integrator is None:
         integrator = _gradient_integrator(config.integrator)
     else:
-        _require_gradients(integrator, type(integrator).__name__)
+        _require_gradients(integrator, str(integrator.class_name()))
     named, derivations = keys_of(params, config.parameters, config.derived, integrator)
     keys = [*named, *derivations]
     notes += _edges(params, keys, integrator)
@@ -463,7 +463,7 @@ def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
 
 def _require_gradients(integrator: mi.Integrator, name: str) -> None:
     if not isinstance(integrator, mi.CppADIntegrator):
-        within = ", without 'aov' around it" if name == "aov" else ""
+        within = ", without 'aov' around it" if name.lower().startswith("aov") else ""
         raise PathreplayError(
             f"Integrator '{name}' computes no gradients; use 'pathreplay' or another AD integrator{within}"
         )

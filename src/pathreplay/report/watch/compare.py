@@ -13,6 +13,7 @@ import numpy as np
 import PIL.Image
 
 from pathreplay.errors import PathreplayError, shown
+from pathreplay.inverse.images.io import Image, alike, read_image
 from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.platform.files import file_names
 from pathreplay.report.page_parts import rounded, uri
@@ -20,9 +21,6 @@ from pathreplay.report.pages.page import Head, Page, Parameter, Picture, Plot, R
 from pathreplay.report.report import MOST_PIXELS, MOST_VIEWS
 from pathreplay.report.watch.past import Past
 from pathreplay.report.watch.run_files import read_own
-
-SAME = 2
-"""Largest difference between images in [0, 255] that rounding errors cause."""
 
 
 def table(runs: list[Past]) -> Table:
@@ -162,19 +160,18 @@ def _views(runs: list[Past]) -> tuple[View, ...]:
 
 
 def _with_other_targets(runs: list[Past], views: list[str]) -> list[str]:
-    """Return the views whose targets look different between runs, in pixels or in exposure."""
+    """Return the views whose targets differ between runs."""
 
-    def differ(name: str) -> bool:
-        first, *others = (_pixels(run, f"target-{name}") for run in runs)
-        return any(found.shape != first.shape or np.abs(found - first).max() > SAME for found in others)
+    def target(run: Past, view: str) -> Image | None:
+        path = run.folder / "images" / f"target-{view}.exr"
+        return read_image(path) if path.is_file() and not path.is_symlink() else None
 
-    return [name for name in views if differ(name)]
-
-
-def _pixels(run: Past, file: str) -> np.ndarray:
-    """Return the values of an image of a run, in [0, 255]; without pixels if the image does not exist."""
-    picture = _opened(run, file)
-    return np.zeros((0, 0, 0)) if picture is None else np.asarray(picture.convert("RGB"), np.float64)
+    names = []
+    for view in views:
+        first, *others = (target(run, view) for run in runs)
+        if first is not None and any(other is not None and not alike(first, other) for other in others):
+            names.append(view)
+    return names
 
 
 def _parameters(runs: list[Past]) -> tuple[Parameter, ...]:
@@ -196,32 +193,24 @@ def _parameters(runs: list[Past]) -> tuple[Parameter, ...]:
 
 def _picture(run: Past, kind: str, caption: str, file: str, most_pixels: float) -> Picture | None:
     """Read an image of a run, and reduce it to ``most_pixels``; None if the image does not exist."""
-    picture = _opened(run, file)
-    if picture is None:
-        return None
-    factor = (most_pixels / (picture.width * picture.height)) ** 0.5
-    if factor < 1:
-        picture = picture.convert("RGB").resize(
-            (max(1, round(picture.width * factor)), max(1, round(picture.height * factor))),
-            PIL.Image.Resampling.BOX,
-        )
-    buffer = io.BytesIO()
-    picture.save(buffer, "png")
-    return Picture(kind, caption, uri("image/png", buffer.getvalue()))
-
-
-def _opened(run: Past, file: str) -> PIL.Image.Image | None:
-    """Read an image of a run; None if it does not exist."""
-    path = run.folder / "images" / f"{file}.png"
-    data = read_own(path)
+    data = read_own(run.folder / "images" / f"{file}.png")
     if data is None:
         return None
     try:
-        picture = PIL.Image.open(io.BytesIO(data), formats=("PNG",))
-        picture.load()
+        with PIL.Image.open(io.BytesIO(data), formats=("PNG",)) as picture:
+            factor = (most_pixels / (picture.width * picture.height)) ** 0.5
+            if factor < 1:
+                small = picture.convert("RGB").resize(
+                    (max(1, round(picture.width * factor)), max(1, round(picture.height * factor))),
+                    PIL.Image.Resampling.BOX,
+                )
+                buffer = io.BytesIO()
+                small.save(buffer, "png")
+                data = buffer.getvalue()
     except (OSError, ValueError, PIL.Image.DecompressionBombError) as error:
+        path = run.folder / "images" / f"{file}.png"
         raise PathreplayError(f"Image {path} cannot be read ({error}); give the folder of a complete run") from None
-    return picture
+    return Picture(kind, caption, uri("image/png", data))
 
 
 def print_table(it: Table) -> None:

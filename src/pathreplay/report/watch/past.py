@@ -56,20 +56,21 @@ class Past:
 
     @cached_property
     def errors(self) -> dict[str, float]:
-        """Errors of the result by name, as in `Entry.errors`. Before the end of the run, those of the last iteration.
+        """Errors of the result by name, as in `Entry.errors`. Without a result, errors after the last iteration.
 
-        The result may be an average of iterates (see `Run.best`), and its errors then differ from those of an iterate.
+        The result may be an average of iterates, whose errors differ from the errors of an iterate. While a finished
+        run goes on, these are the errors of its previous result, like `likeness`.
         """
-        found = dict(self.history[-1].errors) if self.history else {}
+        errors = dict(self.history[-1].errors) if self.history else {}
         for key, entry in self._json("parameters.json").items():
             if not isinstance(entry, dict):
                 continue
-            if isinstance(entry.get("rmse"), (int, float)):
-                found[key] = float(entry["rmse"])
-            if isinstance(pose := entry.get("error"), dict):
-                for name, value in zip(error_names(key), (pose.get("position"), pose.get("degrees")), strict=True):
-                    found |= {name: float(value)} if isinstance(value, (int, float)) else {}
-        return found
+            pose = entry.get("error")
+            of_pose = (pose.get("position"), pose.get("degrees")) if isinstance(pose, dict) else (None, None)
+            for name, value in zip((key, *error_names(key)), (entry.get("rmse"), *of_pose), strict=True):
+                if isinstance(value, (int, float)):
+                    errors[name] = float(value)
+        return errors
 
     def likeness(self, view: str, kind: str) -> float | None:
         """Return an image metric ('psnr' or 'ssim') of the result of a view; None if unknown."""

@@ -1,4 +1,4 @@
-"""Absent lobes: parameters at a value at which Mitsuba neither samples nor evaluates a lobe of a BSDF.
+"""Absent lobes: parameters at a value at which Mitsuba never samples a lobe of a BSDF, or does not even evaluate it.
 
 The derivative of such a lobe is missing from gradients with respect to the parameter.
 """
@@ -21,38 +21,45 @@ ENDS: dict[str, dict[str, tuple[float, ...]]] = {
     "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2), "sheen": (0,)},
 }
 """Values at which a lobe is absent, by class of the BSDF and parameter. Zero is the lower end of a range."""
+BY_MEAN = frozenset({"SmoothPlastic"})
+"""BSDFs that sample lobes by the mean of a parameter. A lobe is absent only if all values are at the end."""
 INSIDE = 1e-3
 """Distance from an end that `ranges_of` keeps. A lobe is sampled with a probability of about this distance, so that the
 noise of the gradient grows as the distance becomes smaller."""
 
 
 def ranges_of(bsdfs: Iterable[mi.BSDF]) -> dict[mi.Object, tuple[float, float]]:
-    """Return the lower and upper bounds of parameters that exclude `ENDS`, by the texture that has the values."""
-    ranges = {}
+    """Return lower and upper bounds that exclude `ENDS`, by the texture whose values they bound, without `BY_MEAN`."""
+    ranges: dict[mi.Object, tuple[float, float]] = {}
     for bsdf in bsdfs:
-        if (ends_of := ENDS.get(bsdf.class_name())) is None:
-            continue
-        for name, texture in children_of(bsdf).items():
-            ends = ends_of.get(name, ())
-            highest = min((end - INSIDE for end in ends if end > 0), default=np.inf)
-            ranges[texture] = INSIDE if 0 in ends else -np.inf, highest
+        names = {} if bsdf.class_name() in BY_MEAN else ENDS.get(bsdf.class_name(), {})
+        textures = children_of(bsdf) if names else {}
+        for name in names.keys() & textures.keys():
+            lower, upper = ranges.get(textures[name], (-np.inf, np.inf))  # the texture may have several uses
+            for end in names[name]:
+                lower, upper = (max(lower, INSIDE), upper) if end == 0 else (lower, min(upper, end - INSIDE))
+            ranges[textures[name]] = lower, upper
     return ranges
 
 
 class AbsentLobes:
-    """Parameters of a scene that have had gradients at one of `ENDS`. Each parameter is examined once."""
+    """Parameters of a scene that were at one of `ENDS` when they were first seen with gradients."""
 
     def __init__(self, bsdfs: Iterable[mi.BSDF]) -> None:
-        self._unexamined = {bsdf: dict(ENDS[bsdf.class_name()]) for bsdf in bsdfs if bsdf.class_name() in ENDS}
-        self._found: dict[str, None] = {}
+        self._unexamined = {bsdf: list(ENDS[bsdf.class_name()]) for bsdf in bsdfs if bsdf.class_name() in ENDS}
+        self._known: list[str] = []
 
     def find(self) -> tuple[str, ...]:
-        """Examine the parameters that have gradients for the first time. Return all that were found, with value."""
-        for bsdf, ends in self._unexamined.items():
-            if not ends or not with_gradients(bsdf, *ends):
+        """Examine the parameters that have gradients for the first time. Return all known ones, as text."""
+        for bsdf, names in self._unexamined.items():
+            if not names or not with_gradients(bsdf, *names):
                 continue
-            for name in [name for name in ends if with_gradients(bsdf, name)]:
-                values = np.concatenate([np.ravel(np.array(dr.detach(x))) for x in with_gradients(bsdf, name)])
-                at = [end for end in ends.pop(name) if np.any(values == end)]
-                self._found |= {f"{name} = {end:g} of '{bsdf.id()}'": None for end in at}
-        return tuple(self._found)
+            kind = str(bsdf.class_name())
+            at_end = np.all if kind in BY_MEAN else np.any
+            for name in list(names):
+                if given := with_gradients(bsdf, f"{name}.value", f"{name}.data"):
+                    names.remove(name)
+                    values = np.concatenate([np.ravel(np.array(dr.detach(value))) for value in given])
+                    ends = [end for end in ENDS[kind][name] if at_end(values == end)]
+                    self._known += [f"{name} = {end:g} of '{bsdf.id()}'" for end in ends]
+        return tuple(self._known)

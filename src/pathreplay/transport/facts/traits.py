@@ -96,7 +96,6 @@ class Traits:
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
     tables_move: bool = False  # the alpha or eta of a `roughplastic`, from which Mitsuba computes tables
-    absent_lobes: tuple[str, ...] = ()  # parameters at values where a lobe is absent, each with its BSDF
     splines_move: bool = False  # the control points of B-spline curves
     skies_move: bool = False  # a parameter of a `sunsky`
     lights_vary: bool = False  # any parameter of an emitter, or of an emissive shape
