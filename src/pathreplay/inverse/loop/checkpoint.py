@@ -68,7 +68,7 @@ class Run:
     """Arrays, by name, that the integrator passes on to later evaluations, such as the control variates of media."""
     history: list[Entry] = field(default_factory=list)
     starts: dict[str, list[float]] = field(default_factory=dict)
-    """Means over parts of each initial value (`movement.parts_of`), and its root mean square, by key."""
+    """Means over parts of each initial value (see `movement.parts_of`), by key."""
     baseline: Run | None = None
     """A run of another integrator for comparison, with the same initial values and the same computation time."""
     whole: bool = True
@@ -178,7 +178,7 @@ def _read(
     starts = _STARTS.validate_json(metadata.get("starts", "{}"), strict=True)
     for key, now in run.starts.items():
         start = starts.get(key, now)
-        if len(now) != len(start) or not np.allclose(now, start, rtol=1e-4, atol=1e-5 * now[-1]):
+        if len(now) != len(start) or not np.allclose(now, start, rtol=1e-4, atol=1e-5 * max(map(abs, now), default=0)):
             raise PathreplayError(
                 f"The initial value of '{key}' differs from the one at the start of the run {path.parent}; restore it "
                 "in the config, scene or file that gives it, or start a new run"

@@ -92,10 +92,7 @@ def new_run(
         executor or Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
         optimiser_of(problem, values, optimizer or Optimizer()),
         values,
-        starts={
-            v.key: [*parts_of(v.start, mean=True), float(np.linalg.norm(v.start) / max(1, v.start.size) ** 0.5)]
-            for v in problem.variables
-        },
+        starts={v.key: parts_of(v.start, mean=True) for v in problem.variables},
     )
 
 

@@ -285,7 +285,8 @@ def build_problem(
     if integrator is None:
         integrator = _gradient_integrator(config.integrator)
     else:
-        _require_gradients(integrator, str(integrator.class_name()))
+        plugin = isinstance(integrator, mi.Integrator)
+        _require_gradients(integrator, str(integrator.class_name()) if plugin else type(integrator).__name__)
     named, derivations = keys_of(params, config.parameters, config.derived, integrator)
     keys = [*named, *derivations]
     notes += _edges(params, keys, integrator)
