@@ -219,6 +219,16 @@ def test_a_notebook_shows_curve_and_images_without_a_folder(
     assert "run: ended" in outputs[-1] and "4 of 4" in outputs[-1]
 
 
+def test_a_signal_ends_a_silent_run_with_a_line(photos: list[np.ndarray], capfd: pytest.CaptureFixture[str]) -> None:
+    def terminate(iteration: pathreplay.Iteration) -> None:
+        if iteration.number == 1:
+            signal.raise_signal(signal.SIGTERM)
+
+    result = run(problem_of(photos), steps=6, callbacks=terminate)
+    assert result.stopped == "SIGTERM" and len(result.history) == 2
+    assert "SIGTERM: stopping after this iteration" in capfd.readouterr().out
+
+
 def test_ten_scenes_one_after_the_other_leave_nothing_behind() -> None:
     """Each in a folder; recordings, locks and threads of one are not in the way of the next."""
     threads, handlers = dr.thread_count(), signal.getsignal(signal.SIGINT)

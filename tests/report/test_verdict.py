@@ -203,4 +203,9 @@ def test_a_verdict_is_one_line_that_names_what_to_do() -> None:
     said = str(whole)
     assert "'b' against 'c'" in said and "affect: 'e'" in said and "moving: 'a'" in said and "noise: 'd'" in said
     assert "\n" not in said and "noise: all" in str(Verdict(arrived=("a", "b")))
+    for moving, arrived in ((("a",), ()), ((), ("a",))):
+        assert ["learning" in str(Verdict(moving, arrived, searches=searches)) for searches in (False, True)] == [
+            True,
+            False,
+        ]
     assert str(Verdict()) == "values: fewer than 20 iterations, too few to test convergence"

@@ -42,7 +42,8 @@ class Result:
     history: list[Entry]
     """One entry per iteration: loss, seconds, gradient norms and more."""
     stopped: str | None
-    """Why the run ended early: 'a callback', 'Ctrl-C', 'the stop button', or the reason why the optimiser stopped."""
+    """Why the run ended early: 'a callback', 'Ctrl-C', 'SIGTERM', 'the stop button', or the reason why the optimiser
+    stopped."""
     problem: Problem
     folder: Path | None = None
     """Run folder, which contains ``report.html``; None if no files were written."""
@@ -114,7 +115,8 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         **settings: further keys of a job, such as ``checkpoint_every``, ``preview`` or ``spp`` (docs/job-reference.md).
 
     Returns:
-        Values, history and the reason of an early end. The first Ctrl-C ends the run after the current iteration.
+        Values, history and the reason of an early end. The first Ctrl-C, SIGTERM or SIGHUP ends the
+            run after the current iteration.
 
     Raises:
         PathreplayError: settings are invalid, loss or values are not finite, or the folder is in use, damaged, or
@@ -132,6 +134,11 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
     built = problem.configured(run_settings("minimize", steps, options, settings), "minimize")
     observers = [callbacks] if callable(callbacks) else list(callbacks)
     return _minimized(problem, built, own, observers, progress, None if output is None else Path(output), resume)
+
+
+def _warn(message: str) -> None:
+    """Log a message of a run without a progress bar, whose early end would otherwise look like a result."""
+    mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
 
 def _minimized(
@@ -178,10 +185,10 @@ def _minimized(
             job = Job(built.config, None, problem.base, in_python=in_python)
             kept = FolderRun(job, built, run, stop, new_output(output, None), Path.cwd(), resumed)
             stack.callback(kept.folder.lock.close)
-        stack.enter_context(stopping(bar.say, "aborted" if kept is None else kept.remedy, stop))
+        say, remedy = bar.say if progress else _warn, "aborted" if kept is None else kept.remedy
+        stack.enter_context(stopping(say, remedy, stop))
         observers = [bar.observe, *_observers(bar, built, run, stop, kept)]
-        # Changing the thread pool once is safer than once per step, see `jobs.optimize`. Callbacks, however, may read
-        # files, for which Mitsuba needs two threads.
+        # Change the thread pool once, see `jobs.optimize`. Callbacks may read files, which needs two threads.
         with one_thread(built.config.deterministic and not callbacks):
             for about in stack.enter_context(closing(iterations(built, run, stop, observers, kept))):
                 if any([_is_true(callback(about)) for callback in callbacks]):

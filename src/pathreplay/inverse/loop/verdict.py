@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,8 @@ class Verdict:
     """Pairs of variables whose effects on the images cancel."""
     unseen: tuple[str, ...] = ()
     """Variables that do not affect the images."""
+    searches: bool = False
+    """Whether the optimiser has no learning rate (see `Optimizer.searches`)."""
 
     def __str__(self) -> str:
         """Summarise the verdict in one line, which also suggests what to change."""
@@ -43,12 +45,13 @@ class Verdict:
         if self.unseen:
             parts.append(f"not determined by the images, which they do not affect: {_listed(self.unseen)}")
         if self.moving:
-            remedy = "run more iterations, or raise learning_rate if they do not oscillate"
-            parts.append(f"still moving: {_listed(self.moving)}: {remedy}")
+            faster = "" if self.searches else ", or raise learning_rate if they do not oscillate"
+            parts.append(f"still moving: {_listed(self.moving)}: run more iterations{faster}")
         free = {key for pair in self.trade_offs for key in pair} | set(self.unseen)
         if arrived := [key for key in self.arrived if key not in free]:
             which = _listed(arrived) if parts else "all"
-            parts.append(f"converged up to noise: {which}: raise spp or let the learning rate decay to improve them")
+            remedy = "raise spp" if self.searches else "raise spp or let the learning rate decay"
+            parts.append(f"converged up to noise: {which}: {remedy} to improve them")
         return "values: " + ("; ".join(parts) or f"fewer than {SHORTEST} iterations, too few to test convergence")
 
 
@@ -68,8 +71,9 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     done = bool(run.optimiser.finished)
     moving = tuple(key for key in known if moves[key] and not done)
     arrived = tuple(key for key in known if key not in moving)
+    verdict = Verdict(moving, arrived, searches=problem.config.optimizer.searches)
     if stopped or not known:
-        return Verdict(moving, arrived)
+        return verdict
     pixels = np.mean([view.target[..., 0].size for view in problem.trained().values()])
     views = problem.config.view_batch_size or len(problem.trained())
     taken = float(pixels) * views * sum(entry.spp for entry in run.history)
@@ -78,12 +82,12 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
         pairs = trade_offs(columns)
     except (PathreplayError, RuntimeError, ValueError, np.linalg.LinAlgError):
         # User functions or Mitsuba may reject perturbed values. The run itself has succeeded, so no error is reported.
-        return Verdict(moving, arrived)
+        return verdict
     # Variables with a nonzero gradient affect the images, even if their finite differences in `columns_of` are zero.
     # For example, the differences of a variable that only moves silhouettes are zero if no sample lies between the
     # silhouettes before and after the perturbation.
     pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
-    return Verdict(moving, arrived, pairs, tuple(key for key in unseen if key not in pulled))
+    return replace(verdict, trade_offs=pairs, unseen=tuple(key for key in unseen if key not in pulled))
 
 
 def _begin(problem: Problem, key: str, run: Run) -> int:

@@ -285,8 +285,7 @@ def build_problem(
     if integrator is None:
         integrator = _gradient_integrator(config.integrator)
     else:
-        plugin = isinstance(integrator, mi.Integrator)
-        _require_gradients(integrator, str(integrator.class_name()) if plugin else type(integrator).__name__)
+        _require_gradients(integrator)
     named, derivations = keys_of(params, config.parameters, config.derived, integrator)
     keys = [*named, *derivations]
     notes += _edges(params, keys, integrator)
@@ -462,8 +461,10 @@ def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
     return integrator
 
 
-def _require_gradients(integrator: mi.Integrator, name: str) -> None:
+def _require_gradients(integrator: mi.Integrator, name: str = "") -> None:
     if not isinstance(integrator, mi.CppADIntegrator):
+        if not name:  # users may also give something else than an integrator
+            name = str(integrator.class_name()) if isinstance(integrator, mi.Integrator) else type(integrator).__name__
         within = ", without 'aov' around it" if name.lower().startswith("aov") else ""
         raise PathreplayError(
             f"Integrator '{name}' computes no gradients; use 'pathreplay' or another AD integrator{within}"
