@@ -199,7 +199,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "no key": (
         {"stages": [{"iterations": 1, "parameters": ["flor.*"]}]},
-        "No parameter 'flor.*' in the job",
+        "No parameter 'flor.*' in the job, and no similar one; it has wall.bsdf.reflectance.data, floor.",
     ),
     "never": ({"stages": [{"iterations": 1, "parameters": [FLOOR]}]}, f"stages: no stage optimises '{TEXTURE}'"),
     "resolutions": (

@@ -87,8 +87,10 @@ def _no_match(known: list[str], pattern: str, owner: str) -> str:
     close = [lower[match] for match in difflib.get_close_matches(pattern.lower(), lower, n=3, cutoff=0.5)]
     if close:
         return f"No parameter '{pattern}' in {owner}; nearest: {', '.join(close)}"
-    where = "mitsuba.traverse(scene)" if owner == "the scene" else owner
-    return f"No parameter '{pattern}' in {owner}, and no similar one; {where} lists all {len(known)}"
+    listed = f"mitsuba.traverse(scene) lists all {len(known)}"
+    if owner != "the scene":
+        listed = f"it has {', '.join(known[:8])}{', ...' if len(known) > 8 else ''}"
+    return f"No parameter '{pattern}' in {owner}, and no similar one; {listed}"
 
 
 def owner_class(params: mi.SceneParameters, key: str) -> str:
