@@ -92,7 +92,7 @@ def test_a_job_and_the_library_give_the_same_bits(photos: list[np.ndarray], tmp_
 
 
 def test_an_evaluation_beside_another_thread_leaves_the_scene_alone(photos: list[np.ndarray]) -> None:
-    """It is refused before it sets values: those of the thread that renders stay in the scene."""
+    """A refused call leaves the values of the rendering thread in the scene."""
     problem = Problem(room(), {WALL: Parameter(initial=[0.4, 0.5, 0.6])}, views(photos), spp=4)
     f, state, told = pathreplay.value_and_grad(problem), pathreplay.init(problem), []
 

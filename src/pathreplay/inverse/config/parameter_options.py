@@ -117,10 +117,11 @@ class Parameter(Table):
     key: str
     """Key of mitsuba.traverse(scene), or a glob such as '*.reflectance.value'."""
     lower: Finite | None = None
-    """Lower bound, enforced by projection after each step. If a BSDF omits a lobe at a value at the end of its range,
-    for example at metallic = 1 of 'principled', values stay 0.001 inside of the range."""
+    """Lower bound, enforced by projection after each step. If a BSDF omits a lobe at the smallest value, for example at
+    sheen = 0 of 'principled', values stay 0.001 above it."""
     upper: Finite | None = None
-    """Upper bound, enforced by projection after each step."""
+    """Upper bound, enforced by projection after each step. If a BSDF omits a lobe at the largest value, for example at
+    metallic = 1 of 'principled', values stay 0.001 below it."""
     learning_rate: Positive | None = None
     """Learning rate of this parameter; default: the learning rate of the job."""
     initial: Initial | None = None
