@@ -83,6 +83,27 @@ def test_a_sky_around_nothing_has_its_gradient(hide_emitters: bool) -> None:
         assert np.array(dr.grad(params[SKY])) == pytest.approx(0 if hide_emitters else 1 / 3, rel=1e-4)
 
 
+@pytest.mark.parametrize("adjoint", ["recorded", "replay"])
+@pytest.mark.parametrize("kind", ["lamp", "envmap"])
+def test_black_texels_have_the_gradient_of_dark_ones(kind: str, adjoint: str) -> None:
+    """Mitsuba's density of a map that is black everywhere is not a number. Light is linear in it."""
+
+    def slope(brightness: float) -> float:
+        texels = np.full((4, 4, 3), brightness, np.float32)
+        if kind == "envmap":
+            scene, key = world(lights={"sky": {"type": "envmap", "bitmap": mi.Bitmap(texels)}}), "sky.data"
+        else:
+            lamp = painted_lamp()
+            lamp["emitter"]["radiance"]["data"] = mi.TensorXf(texels)
+            scene, key = world(lights={"lamp": lamp}), "lamp.emitter.radiance.data"
+        with attached(scene, key) as params:
+            integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "adjoint": adjoint})
+            integrator.render_backward(scene, params, even(), seed=SEED, spp=1024)
+            return float(np.array(dr.grad(params[key])).sum())
+
+    assert slope(0) == pytest.approx(slope(1e-3), rel=0.03)
+
+
 def test_it_knows_when_it_will_do() -> None:
     assert alone(world(), LAMP) and alone(world(), LAMP, SKY)
     assert not alone(world(), LAMP, FLOOR) and not alone(world(), BALL) and not alone(world())

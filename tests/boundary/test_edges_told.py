@@ -153,9 +153,12 @@ def test_a_script_is_told_of_lobes_that_are_absent(log: Any) -> None:
         assert len(lines) == count and all(value in line for value, line in zip(told, lines, strict=False))
 
 
+@pytest.mark.parametrize("plastic", ["plastic", "roughplastic"])
 @pytest.mark.parametrize(("colour", "count"), [((0.6, 0.0, 0.0), 0), ((0.0, 0.0, 0.0), 1)])
-def test_plastic_leaves_out_a_lobe_whose_whole_colour_is_black(colour: tuple[float, ...], count: int, log: Any) -> None:
-    bsdf = {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": colour}}
+def test_plastic_leaves_out_a_lobe_whose_whole_colour_is_black(
+    plastic: str, colour: tuple[float, ...], count: int, log: Any
+) -> None:
+    bsdf = {"type": plastic, "diffuse_reflectance": {"type": "rgb", "value": colour}}
     scene = make_scene(cube={"type": "cube", "bsdf": bsdf})
     with attached(scene, "cube.bsdf.diffuse_reflectance.value"):
         integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})

@@ -160,6 +160,28 @@ def test_what_is_around_the_scene_is_that_of_path(light: str, hide_emitters: boo
     assert ours[:, 3] == pytest.approx(1) if covered else (ours[:, 3] < 0.9).all()
 
 
+def behind(bsdf: dict) -> mi.Scene:
+    """A sheet that fills the picture, before a white sky."""
+    view = camera() | {"film": camera()["film"] | {"pixel_format": "rgba"}}
+    sheet = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100), "bsdf": bsdf}
+    return mi.load_dict({"type": "scene", "camera": view, "sheet": sheet, "sky": {"type": "constant"}})
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "null"}, {"type": "thindielectric"}])
+def test_a_hidden_sky_stays_hidden_behind_a_sheet(bsdf: dict) -> None:
+    """As with `path`, in colour and alpha."""
+    scene = behind(bsdf)
+    ours, theirs = (means(scene, type=kind, max_depth=4, hide_emitters=True) for kind in ("pathreplay", "path"))
+    assert_equal_means(ours, theirs)
+
+
+def test_a_hidden_sky_lights_a_mask() -> None:
+    """A white sky and grey paint: the radiance is that of the paint alone. `path` loses half of the emitter samples."""
+    paint = {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse", "reflectance": 0.5}}
+    ours = means(behind(paint), type="pathreplay", max_depth=4, hide_emitters=True)
+    assert ours.mean(0) == pytest.approx([0.15, 0.15, 0.15, 0.3], abs=2e-3)
+
+
 def test_a_sphere_behind_a_hidden_lamp_is_where_it_is() -> None:
     """Mitsuba's path and prb misplace it: they lose the distance to the lamp. A camera beyond the lamp is right."""
     ours = means(lamp_in_view("sphere"), type="pathreplay", hide_emitters=True)

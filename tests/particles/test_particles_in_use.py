@@ -336,6 +336,20 @@ def test_edges_in_the_light_of_a_projector_are_told(log: list[str]) -> None:
     assert any("leaves out edges in the light of emitter 'light': " in line for line in log), log
 
 
+@pytest.mark.parametrize(("darkest", "count"), [(0.0, 1), (0.01, 0)])
+def test_black_texels_of_a_lamp_are_told_once(darkest: float, count: int, log: list[str]) -> None:
+    """No light path starts there."""
+    texels = mi.TensorXf(np.repeat(np.float32([darkest, 1, 1, 1]), 3).reshape(2, 2, 3))
+    made = balls()
+    made["light"]["emitter"]["radiance"] = {"type": "bitmap", "raw": True, "data": texels}
+    scene = loaded(made)
+    for _ in range(2):
+        gradient(scene, PARTICLES, "light.emitter.radiance.data", 4)
+    told = [line for line in log if "black texels" in line]
+    assert len(told) == count, log
+    assert all("'radiance.data' of emitter 'light" in line for line in told)
+
+
 def test_a_shape_of_distances_has_no_boundary_term(log: list[str]) -> None:
     """As for camera paths: it is left out by default, and refused on request."""
     scene = balls("glass", light="point")

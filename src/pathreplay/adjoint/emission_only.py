@@ -24,11 +24,14 @@ from pathreplay.transport.vertex import TraceConfig
 def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """Return whether only emitted radiance has gradients: no weight depends on a parameter, and nothing moves.
 
-    The result is always False in scenes with media. It is also always False if symbolic calls are turned off in Dr.Jit.
+    The result is always False in scenes with media, or with a `directionalarea` emitter, which `relight` cannot
+    evaluate. It is also always False if symbolic calls are turned off in Dr.Jit.
     With symbolic calls, one traced step covers the virtual functions of all objects of the scene. Without symbolic
     calls, the step would cover only the objects at the first vertices.
     """
     if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
+        return False
+    if trace.traits.directed_areas:
         return False
     if not trace.scene.shapes():  # without shapes, no virtual function of a BSDF is traced
         return False

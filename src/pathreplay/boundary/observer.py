@@ -280,7 +280,7 @@ class ObserverVertex:
             unsampled = self.event & ~self.at.medium.use_emitter_sampling()
         at = Arrival(ray, hit, pdf, unsampled, mi.Bool(False))
         if self.trace.without_caustics:
-            at.scattered = self.at.scattered | (self.at.camera & ~unsampled)
+            at.scattered = self.at.scattered | ((self.selected.depth == 0) & ~unsampled)
         return at if self.trace.media is None else replace(at, medium=self.medium(ray.d), behind=mi.Float(0))
 
     def transmittance_past_edge(

@@ -66,6 +66,16 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
             "pathreplay: an instance's to_world has a gradient, but Mitsuba does not differentiate the normals "
             f"of instances: move the {compat.positions_name()} of the shapes in its group, or use a shape of its own"
         )
+    if traits.blended_mirrors:
+        yield (
+            "a blendbsdf contains a lobe of delta reflection or transmission (a mirror, glass, plastic), whose samples "
+            "Mitsuba weighs wrongly: image and gradient are biased; use a rough lobe instead"
+        )
+    if traits.directed_areas and trace.to_sensor is None:
+        yield (
+            "camera paths do not find the light of a directionalarea emitter, which image and gradient lack: "
+            "use 'pathreplay_particles'"
+        )
     if traits.masks_mirrors:
         yield (
             "a mask covers delta lobes, which Mitsuba then cannot sample one by one: derivatives with respect to "
@@ -105,6 +115,16 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
         )
     if traits.detached_names:
         yield f"attach = 'all' keeps the directions of {', '.join(traits.detached_names)} fixed"
+
+
+def particle_doubts(trace: TraceConfig) -> Iterator[str]:
+    """Yield messages about properties of the scene that make the gradient of light paths incomplete."""
+    for texels in facts_of(trace.scene).dark_texels():
+        yield (
+            f"{texels} has black texels, at which no light path starts: their derivative is missing from the gradient "
+            "of light paths; start from a small value, and keep the texels above it, or trace all paths from the "
+            "sensor; see docs/particles.md"
+        )
 
 
 def particle_notes(trace: TraceConfig, sensor: mi.Sensor, omitted: Iterable[str] | None) -> Iterator[str]:

@@ -26,6 +26,7 @@ from pathreplay.integrators.diagnostics import (
     lost_note,
     missing_edges,
     offset_note,
+    particle_doubts,
     particle_notes,
     used_before_note,
 )
@@ -366,7 +367,8 @@ class PathReplayIntegrator(PathIntegrator):
 
         A pass never uses a control variate to which it has contributed, because the gradient would be biased.
         """
-        for doubt in filter(None, (*doubts(trace), *(term.note(trace) for term in self.terms))):
+        hidden = () if self.particles is None else particle_doubts(trace)
+        for doubt in filter(None, (*doubts(trace), *hidden, *(term.note(trace) for term in self.terms))):
             self._warn_once(doubt)
         if trace.media is None or state.guess is None:
             return None

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from pathreplay.integrators.path_integrator import UNBOUNDED
@@ -41,5 +42,11 @@ def read_limits(integrator: mi.Integrator) -> Limits | None:
     rr_depth: Any = getattr(integrator, "rr_depth", printed.get("rr_depth", 5))
     if max_depth is None:
         return None
-    depth = int(max_depth)  # Mitsuba's Python integrators store -1 as UNBOUNDED
-    return Limits(-1 if depth >= UNBOUNDED else depth, int(rr_depth), bool(getattr(integrator, "hide_emitters", False)))
+    depth = _whole(max_depth)  # Mitsuba's Python integrators store -1 as UNBOUNDED
+    hides = bool(getattr(integrator, "hide_emitters", False))
+    return Limits(-1 if depth >= UNBOUNDED else depth, _whole(rr_depth), hides)
+
+
+def _whole(number: Any) -> int:
+    """Convert a depth to an integer. `volprim_rf_basic` stores depths in Dr.Jit arrays."""
+    return int(number[0] if isinstance(number, dr.ArrayBase) else number)

@@ -10,6 +10,7 @@ import numpy as np
 from pathreplay.integrators.lifetimes import SCENES, is_recording
 from pathreplay.platform import compat
 from pathreplay.transport.facts.absent_lobes import AbsentLobes, ranges_of
+from pathreplay.transport.facts.dark_texels import DarkTexels
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of, plain_numbers, with_gradients
 from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
@@ -59,7 +60,7 @@ class SceneFacts:
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
         self._bounded = any(shape.is_medium_transition() for shape in self._shapes)
         self._bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
-        self._absent_lobes = AbsentLobes(self._bsdfs)
+        self._absent_lobes, self._dark_texels = AbsentLobes(self._bsdfs), DarkTexels(self._lights)
         self._with_constants = [
             node for node in nodes if isinstance(node, _kinds_with_constants()) and plain_numbers(node)
         ]
@@ -85,6 +86,10 @@ class SceneFacts:
     def absent_lobes(self) -> tuple[str, ...]:
         """Return the parameters that lack the derivative of a lobe (see `AbsentLobes`). Empty in a recording."""
         return () if is_recording() else self._absent_lobes.find()
+
+    def dark_texels(self) -> tuple[str, ...]:
+        """Return the emitters at whose black texels no light path starts (see `DarkTexels`). Empty in a recording."""
+        return () if is_recording() else self._dark_texels.find()
 
     def ranges(self) -> dict[mi.Object, tuple[float, float]]:
         """Return bounds that keep parameters of BSDFs away from values at which a lobe is absent (see `ranges_of`)."""
@@ -155,8 +160,8 @@ class SceneFacts:
     def enclose(self, scene: mi.Scene) -> None:
         """Update the bounding sphere of the scene that infinite emitters know.
 
-        Light paths from such emitters start on this sphere. Mitsuba 3.9 sets it when the scene is loaded, but not when
-        shapes move.
+        Shadow rays to such emitters end on this sphere, and light paths start on it. Mitsuba 3.9 sets it when the scene
+        is loaded, but not when shapes move.
         """
         box = scene.bbox()
         if self._infinite and box != self._box:

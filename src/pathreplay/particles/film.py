@@ -45,7 +45,7 @@ class ParticleFilm:
     height: int
     n: int  # pixels along one side of a footprint
     meter: bool  # the sensor is an irradiance meter, whose film has a single pixel
-    mass: float  # integral of the filter over the film plane
+    mass: float | mi.Float  # integral of the filter over the film plane
 
     @staticmethod
     def of(sensor: mi.Sensor) -> ParticleFilm:
@@ -58,13 +58,8 @@ class ParticleFilm:
                 "spectra; take an hdrfilm"
             )
         filter, (width, height) = film.rfilter(), film.crop_size()
-        key = str(filter), float(filter.radius())
-        if key not in _LENGTHS:
-            _LENGTHS[key] = _length(filter)
-        meter = sensor.class_name() == METER
-        return ParticleFilm(
-            film, int(width), int(height), math.ceil(2 * float(filter.radius())), meter, _LENGTHS[key] ** 2
-        )
+        meter, mass = sensor.class_name() == METER, _length(filter) ** 2
+        return ParticleFilm(film, int(width), int(height), math.ceil(2 * float(filter.radius())), meter, mass)
 
     @property
     def pixels(self) -> int:
@@ -110,7 +105,7 @@ class ParticleFilm:
         x, y = at.corner.x + column, at.corner.y + row
         return mi.UInt32(y * self.width + x), (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
-    def scale(self, number: int) -> float:
+    def scale(self, number: int) -> float | mi.Float:
         """Return the factor that converts a sum over ``number`` light paths to an image."""
         return self.pixels / (number * (1.0 if self.meter else self.mass))
 
@@ -142,16 +137,21 @@ class ParticleFilm:
         return buffer
 
 
-# Cache of the integrals of filters along one axis. A pass that `dr.freeze` records cannot compute the integrals. The
-# keys are the string representations and radii of the filters: the representation of a gaussian filter has only two
-# digits, but its radius is four standard deviations.
+# Cache of the integrals of filters along one axis. The keys are the string representations and radii of the filters:
+# the representation of a gaussian filter has only two digits, but its radius is four standard deviations.
 _LENGTHS: dict[tuple[str, float], float] = {}
 
 
-def _length(filter: mi.ReconstructionFilter) -> float:
+def _length(filter: mi.ReconstructionFilter) -> float | mi.Float:
+    """Return the integral of a filter along one axis. A pass that `dr.freeze` records includes its computation."""
     radius = float(filter.radius())
-    at = ((np.arange(STEPS) + 0.5) / STEPS * 2 - 1) * radius
-    return 2 * radius * float(np.mean(filter.eval(mi.Float(at.astype(np.float32))).numpy(), dtype=float))
+    key = str(filter), radius
+    if key not in _LENGTHS:
+        at = ((dr.arange(mi.Float, STEPS) + 0.5) / STEPS * 2 - 1) * radius
+        if dr.flag(dr.JitFlag.FreezingScope):
+            return 2 * radius * dr.mean(filter.eval(at))
+        _LENGTHS[key] = 2 * radius * float(np.mean(filter.eval(at).numpy(), dtype=float))
+    return _LENGTHS[key]
 
 
 def colour(c: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.Color3f:

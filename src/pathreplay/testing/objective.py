@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import stateful
 from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes.descriptions import errors_as
@@ -103,6 +104,7 @@ class Objective:
     def image(self, integrator: mi.Integrator, seed: int, spp: int, t: float = 0.0) -> np.ndarray:
         """Render the image at t (height x width x channels)."""
         self.put(dr.opaque(mi.Float, t))
+        facts_of(self.scene).enclose(self.scene)
         return np.array(self._render(integrator, seed, spp), np.float64)
 
     def difference(self, integrator: mi.Integrator, stencil: Stencil, h: float, seed: int, spp: int) -> np.ndarray:

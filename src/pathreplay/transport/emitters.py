@@ -27,7 +27,9 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
         if at.behind is not None:
             origin.p -= at.behind * at.ray.d
         ds = mi.DirectionSample3f(scene, si=si, ref=origin)
-        mis = mis_weight(at.pdf, scene.pdf_emitter_direction(origin, ds, active & ~at.delta))
+        pdf_light = scene.pdf_emitter_direction(origin, ds, active & ~at.delta)
+        # The density of a texture that is black everywhere is not a number. Emitter samples never find its emission.
+        mis = mis_weight(at.pdf, dr.select(dr.isfinite(pdf_light), pdf_light, 0))
     return mis * ds.emitter.eval(si, active)
 
 
@@ -77,7 +79,7 @@ def redraw_emitter(
     differentiated.
     """
     scene = trace.scene
-    if attached:
+    if attached or trace.traits.directed_areas:  # Mitsuba does not implement `eval_direction` of such emitters
         painted = mi.Bool(False)
         if trace.traits.painted_meshes:
             still, _ = draw_emitter(scene, dr.detach(origin), u, lit, visible=False)

@@ -73,7 +73,7 @@ class PathState:
         η = self.η * step.eta
         rr_weight, survives = survival(lasting, η, self.depth, u.roulette, trace, step)
         active = step.active & survives & (dr.max(lasting) != 0)
-        at = next_arrival(trace, self.at, step, active) if at is None else at
+        at = next_arrival(trace, self.at, step, active, self.depth == 0) if at is None else at
         β_alive = None if β_alive is None else β_alive * rr_weight
         onward = PathState(at, β * rr_weight, β_alive, η, self.passed(trace, step), active)
         return onward, VertexRecord(self.at, u, step.kept, active, at.hit, rr_weight, self.β)
@@ -110,10 +110,14 @@ def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spe
     return β_alive * mi.Spectrum(dr.select((w == 0) & (β != 0), stand_in, w))
 
 
-def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.Bool) -> Arrival:
+def next_arrival(
+    trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.Bool, first: mi.Bool | bool = False
+) -> Arrival:
     """Trace the continuation of a step to the next vertex. ``at`` is the arrival at the vertex of the step.
 
-    MIS ignores null boundaries between media: the density of the last scattering event remains valid behind a boundary.
+    ``first`` is the mask of paths that leave their first vertex. MIS ignores null boundaries between media: the density
+    of the last scattering event remains valid behind a boundary. Environments hidden by ``hide_emitters`` stay hidden
+    behind surfaces that the path passes unscattered. In scenes with media, this is also true of area emitters.
     """
     kept, null, ray = step.kept, step.null, step.ray_next
     hit = meet(trace, ray, active)
@@ -121,9 +125,10 @@ def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.
         hit = skip_null(trace, ray, hit, active)
     scattered = at.scattered
     if trace.without_caustics:
-        scattered = dr.select(at.camera, ~kept.delta if trace.media is None else ~(kept.delta | null), at.scattered)
+        scattered = dr.select(first, ~kept.delta if trace.media is None else ~(kept.delta | null), at.scattered)
     if trace.media is None:
-        return Arrival(ray, hit, kept.pdf, kept.delta, mi.Bool(False), scattered=scattered)
+        camera = null & at.camera if trace.hide_emitters and trace.to_sensor is None else mi.Bool(False)
+        return Arrival(ray, hit, kept.pdf, kept.delta, camera, scattered=scattered)
     camera = null & at.camera
     if trace.hide_emitters and trace.to_sensor is None:
         hit = behind_emitters(trace, ray, hit, active & camera)

@@ -249,8 +249,9 @@ def _delta_weight(
         alone = mi.BSDFContext(ctx.mode)
         alone.component = k
         # On the back of a two-sided BSDF, ``sampled_component`` is numbered from zero, but ``component`` continues the
-        # numbering of the front. If a scene has two-sided BSDFs, all components are therefore tried.
-        picked = missing if trace.traits.two_sides else missing & (kept.lobe == k)
+        # numbering of the front. The same is true of the second BSDF of a blend. If a scene has such BSDFs, all
+        # components are therefore tried.
+        picked = missing if trace.traits.renumbered else missing & (kept.lobe == k)
         sample, w_k = v.bsdf.sample(alone, v.si, u.lobe, u.direction, picked)
         w_k *= dr.detach(reciprocal(kept.pdf))
         if ctx.mode == mi.TransportMode.Importance:
@@ -259,6 +260,11 @@ def _delta_weight(
         same &= dr.all(dr.abs(dr.detach(w_k) - drawn) <= SAME_LOBE * dr.abs(drawn))
         w = dr.select(same, w_k, w)
         missing &= ~same
+    if trace.traits.blended_veils:
+        # Mitsuba cannot sample the transmission of a mask inside of a blend alone, but evaluates it.
+        T = v.bsdf.eval_null_transmission(v.si, missing)
+        missing &= dr.squared_norm(v.si.wi + v.si.to_local(kept.d)) < SAME_LOBE
+        w = dr.select(missing & dr.all(dr.detach(T) > 0), drawn * T * dr.detach(reciprocal(T)), w)
     return w
 
 

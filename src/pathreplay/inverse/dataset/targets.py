@@ -12,6 +12,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import film_size, picture_shape, require_film
+from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.inverse.config.parameter_options import Value
 from pathreplay.inverse.config.tables import Argument
 from pathreplay.inverse.config.target_options import Target
@@ -113,6 +114,7 @@ def rendered_targets(
         )
     require_films(scene, sensors, {"target.spp": target.spp})
     targets: dict[str, Image] = {}
+    facts_of(scene).enclose(scene)
     for name, index in sensors.items():
         with errors_as(f"Integrator '{plugin.type}' cannot render the target of sensor '{name}'"):
             image = mi.render(scene, sensor=index, integrator=integrator, spp=target.spp, seed=mi.UInt32(seeds[name]))

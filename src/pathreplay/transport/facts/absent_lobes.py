@@ -17,11 +17,12 @@ ENDS: dict[str, dict[str, tuple[float, ...]]] = {
     "MaskBSDF": {"opacity": (0, 1)},
     "BlendBSDF": {"weight": (0, 1)},
     "SmoothPlastic": {"diffuse_reflectance": (0,), "specular_reflectance": (0,)},
+    "RoughPlastic": {"diffuse_reflectance": (0,), "specular_reflectance": (0,)},
     "Principled": {"metallic": (1,), "spec_trans": (0, 1), "clearcoat": (0,), "sheen": (0,)},
     "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2), "sheen": (0,)},
 }
 """Values at which a lobe is absent, by class of the BSDF and parameter. Zero is the lower end of a range."""
-BY_MEAN = frozenset({"SmoothPlastic"})
+BY_MEAN = frozenset({"SmoothPlastic", "RoughPlastic"})
 """BSDFs that sample lobes by the mean of a parameter. A lobe is absent only if all values are at the end."""
 INSIDE = 1e-3
 """Distance from an end that `ranges_of` keeps. A lobe is sampled with a probability of about this distance, so that the

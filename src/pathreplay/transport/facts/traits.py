@@ -23,7 +23,7 @@ from pathreplay.transport.velocity import blend_length
 # BSDFs are identified by class name, because Mitsuba does not expose the properties that matter here. ATTACHABLE BSDFs
 # sample a direction that is a smooth function of the random numbers, and choose a lobe independently of all parameters.
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
-MASK, TWO_SIDED, PLASTIC = "MaskBSDF", "TwoSidedBRDF", "RoughPlastic"
+MASK, BLEND, TWO_SIDED, PLASTIC = "MaskBSDF", "BlendBSDF", "TwoSidedBRDF", "RoughPlastic"
 RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
 # BSDFs that have no narrow lobe of their own. BSDFs nested in them may have one.
@@ -31,6 +31,7 @@ DULL = FRAMES | {MASK, "SmoothDiffuse"}
 # BSDFs whose sampled weights are differentiated correctly: see `scatter._delta_weight`.
 EXACT = frozenset({"SmoothConductor", "SmoothDielectric", "DielectricAD"})
 INSTANCE, PROJECTOR, SPOT, SUNSKY = "Instance", "Projector", "SpotLight", "SunskyEmitter"
+DIRECTED_AREA = "DirectionalArea"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Entries of `Tables.groups_at`: WHOLE for shapes whose only edges are outlines, FACETS for flat-shaded meshes."""
 COARSE = 1.0
@@ -77,16 +78,19 @@ class Traits:
     hard_lights: bool  # some emitter casts hard shadows
     projectors: tuple[mi.Emitter, ...]  # projectors: the illuminated region has a hard boundary
     spots: tuple[mi.Emitter, ...]  # spot lights: their cone has a hard boundary if beam_width >= cutoff_angle
+    directed_areas: bool  # some emitter is a `directionalarea`, which camera paths do not find
     broken_lights: bool  # the samples of some emitter are discontinuous: see `_bounding_sphere`
     sphere_lights: bool  # some sphere emits
     coarse_meshes: bool  # some smooth-shaded mesh is coarse: see `is_coarse`
     brushed_meshes: bool  # some coarse mesh has a BSDF that depends on the tangent
     painted_meshes: bool  # some mesh emits with a textured radiance
-    two_sides: bool  # some surface may have a different BSDF on its back
+    renumbered: bool  # some sampled component may differ from its number in ``component``: see `_delta_weight`
     copies: bool  # there are instances
     splines: bool  # there are B-spline curves
     veils: bool  # some surface may scatter part of the light and transmit the rest unscattered
     masks_mirrors: bool  # some mask covers delta lobes
+    blended_veils: bool  # some blend transmits a part of the light unscattered
+    blended_mirrors: bool  # some blend contains lobes of delta reflection or transmission
     narrow: bool  # some surface may have a narrow smooth lobe
     glossy: bool  # `narrow` is True, and there is no checkerboard, whose seams boundary terms do not cover
     outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
@@ -118,6 +122,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     ]
     coarse = [shape for shape in shapes if is_mesh(shape) and is_coarse(shape)]
     masked = [n for bsdf in bsdfs if bsdf.class_name() == MASK for n in nodes_of(bsdf) if isinstance(n, mi.BSDF)]
+    blends = [bsdf for bsdf in bsdfs if bsdf.class_name() == BLEND]
     narrow = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
@@ -128,16 +133,19 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         projectors=tuple(light for light in scene.emitters() if light.class_name() == PROJECTOR),
         spots=tuple(light for light in scene.emitters() if light.class_name() == SPOT),
+        directed_areas=any(light.class_name() == DIRECTED_AREA for light in scene.emitters()),
         broken_lights=any(_bounding_sphere(shape)[3] > 0 for shape in shapes if shape.is_emitter()),
         sphere_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
         coarse_meshes=bool(coarse),
         brushed_meshes=any(is_brushed(shape.bsdf()) for shape in coarse),
         painted_meshes=any(is_painted(s.emitter()) for s in shapes if s.is_emitter() and is_mesh(s)),
-        two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
+        renumbered=any(bsdf.class_name() in (TWO_SIDED, BLEND) for bsdf in bsdfs),
         copies=any(shape.class_name() == INSTANCE for shape in shapes),
         splines=any(shape.shape_type() == mi.ShapeType.BSplineCurve for shape in shapes),
         veils=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf) for bsdf in bsdfs),
         masks_mirrors=any(map(_delta_lobes, masked)),
+        blended_veils=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in blends),
+        blended_mirrors=any(map(_is_specular, blends)),
         narrow=narrow,
         glossy=narrow and not any(node.class_name() == CHECKERBOARD for node in nodes),
         outlines=not _seamless(shapes, nodes),
@@ -304,6 +312,11 @@ def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
     textured = any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes)
     kind = shapes[0].shape_type()
     return kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk) or (kind == mi.ShapeType.Sphere and not textured)
+
+
+def _is_specular(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF has a lobe of delta reflection or transmission. Transmission without scattering is none."""
+    return bool(bsdf.flags() & (mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission))
 
 
 def _delta_lobes(bsdf: mi.BSDF) -> int:
