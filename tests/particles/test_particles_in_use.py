@@ -281,6 +281,46 @@ def test_a_sky_alone_lights_the_scene() -> None:
     assert np.abs(gap(ours.mean((1, 2)), theirs.mean((1, 2))).z).max() < Z_LIMIT
 
 
+@BOTH
+def test_a_frozen_step_may_be_the_first_use(plugin: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The integral of the filter is then part of the recording."""
+    monkeypatch.setattr("pathreplay.particles.film._LENGTHS", {})
+    key, integrator = "floor.bsdf.reflectance.value", mi.load_dict(plugin)
+
+    def step(scene: mi.Scene, params: mi.SceneParameters, seed: mi.UInt32) -> mi.Float:
+        image = mi.render(scene, params, integrator=integrator, spp=16, seed=seed)
+        dr.backward(dr.mean(image, axis=None))
+        return dr.detach(dr.mean(image, axis=None).array)
+
+    def results(function: Any) -> list[tuple[float, float]]:
+        scene = loaded(balls("glass", light="point"))
+        params, found = mi.traverse(scene), []
+        for seed in range(2):
+            params[key] = mi.Color3f(0.5)
+            dr.enable_grad(params[key])
+            params.update()
+            found.append((function(scene, params, mi.UInt32(seed))[0], dr.grad(params[key]).x[0]))
+        return found
+
+    frozen = results(dr.freeze(step))
+    assert frozen == [pytest.approx(plain, rel=1e-4) for plain in results(step)]
+
+
+@pytest.mark.parametrize("key", ["bulb.intensity.value", "floor.bsdf.reflectance.value"])
+def test_lamps_that_camera_paths_do_not_find_leave_gradients_right(key: str, log: list[str]) -> None:
+    """A `directionalarea` has no light for them, so that gradients are those without it."""
+    made = balls(light="point")
+    made["bulb"] = made.pop("light")
+    away = mi.ScalarTransform4f().look_at([0, 3, 0], [0, 0, 0], [0, 0, 1])
+    lamp = {"type": "rectangle", "to_world": away, "emitter": {"type": "directionalarea"}, "bsdf": {"type": "null"}}
+    found = []
+    for more in ({}, {"lamp": lamp}):
+        scene = loaded({**made, **more})
+        found.append(np.array(gradient(scene, {"type": "pathreplay", "max_depth": 3}, key, 512)))
+        assert any("directionalarea" in line for line in log) == bool(more)
+    assert found[1] == pytest.approx(found[0], rel=0.05)
+
+
 # ------------------------------ What is said ------------------------------
 
 
@@ -337,17 +377,16 @@ def test_edges_in_the_light_of_a_projector_are_told(log: list[str]) -> None:
 
 
 @pytest.mark.parametrize(("darkest", "count"), [(0.0, 1), (0.01, 0)])
-def test_black_texels_of_a_lamp_are_told_once(darkest: float, count: int, log: list[str]) -> None:
+def test_black_texels_of_a_lamp_are_told(darkest: float, count: int, log: list[str]) -> None:
     """No light path starts there."""
     texels = mi.TensorXf(np.repeat(np.float32([darkest, 1, 1, 1]), 3).reshape(2, 2, 3))
     made = balls()
     made["light"]["emitter"]["radiance"] = {"type": "bitmap", "raw": True, "data": texels}
     scene = loaded(made)
-    for _ in range(2):
-        gradient(scene, PARTICLES, "light.emitter.radiance.data", 4)
+    gradient(scene, PARTICLES, "light.emitter.radiance.data", 4)
     told = [line for line in log if "black texels" in line]
     assert len(told) == count, log
-    assert all("'radiance.data' of emitter 'light" in line for line in told)
+    assert all("'radiance.data' of emitter 'light'" in line for line in told)
 
 
 def test_a_shape_of_distances_has_no_boundary_term(log: list[str]) -> None:

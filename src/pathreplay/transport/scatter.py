@@ -245,6 +245,12 @@ def _delta_weight(
     """
     drawn = dr.detach(w)
     missing = mi.Bool(active)
+    if trace.traits.blended_veils:
+        # Mitsuba evaluates the unscattered transmission of a blend, but cannot sample that of a mask inside of it.
+        T = v.bsdf.eval_null_transmission(v.si, active)
+        straight = active & (dr.squared_norm(v.si.wi + v.si.to_local(kept.d)) < SAME_LOBE) & dr.all(dr.detach(T) > 0)
+        w = dr.select(straight, drawn * T * dr.detach(reciprocal(T)), w)
+        missing &= ~straight
     for k in range(trace.traits.lobes):
         alone = mi.BSDFContext(ctx.mode)
         alone.component = k
@@ -260,11 +266,6 @@ def _delta_weight(
         same &= dr.all(dr.abs(dr.detach(w_k) - drawn) <= SAME_LOBE * dr.abs(drawn))
         w = dr.select(same, w_k, w)
         missing &= ~same
-    if trace.traits.blended_veils:
-        # Mitsuba cannot sample the transmission of a mask inside of a blend alone, but evaluates it.
-        T = v.bsdf.eval_null_transmission(v.si, missing)
-        missing &= dr.squared_norm(v.si.wi + v.si.to_local(kept.d)) < SAME_LOBE
-        w = dr.select(missing & dr.all(dr.detach(T) > 0), drawn * T * dr.detach(reciprocal(T)), w)
     return w
 
 

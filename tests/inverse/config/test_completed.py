@@ -58,6 +58,7 @@ def test_a_job_without_integrator_has_the_depth_and_options_of_the_scenes() -> N
     ours = problem("pathreplay", options).integrator
     assert (ours.boundary, ours.adjoint, read_limits(ours)) == ("primary", "replay", Limits(2, 5, True))
     assert read_limits(problem(integrator={"type": "pathreplay"}).integrator) == Limits(6, 5, False)
+    assert read_limits(mi.load_dict({"type": "volprim_rf_basic", "max_depth": 9, "rr_depth": 7})) == Limits(9, 7, False)
 
 
 HIDDEN = '<boolean name="hide_emitters" value="true"/>'

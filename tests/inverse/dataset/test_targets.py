@@ -225,6 +225,26 @@ def test_grey_is_not_alpha(folder: Path) -> None:
         target_of("grey.png")
 
 
+def test_a_target_has_the_shadow_of_a_shape_that_has_left_the_scene(folder: Path) -> None:
+    """A plate between floor and sun. Mitsuba keeps the bounding sphere that the scene had when it was loaded."""
+    plate = '<shape type="cube" id="plate"><transform name="to_world"><translate z="{z}"/></transform></shape>'
+    sun = '<emitter type="directional" id="sun"><vector name="direction" x="0" y="0" z="-1"/></emitter>'
+    look = '<transform name="to_world"><lookat origin="3, 0, 3" target="0, 0, 0" up="0, 0, 1"/></transform>'
+    for name, z in (("low", 1), ("high", 20)):
+        made = scene().split("<shape")[0].replace('<float name="fov"', look + '<float name="fov"')
+        floor = '<shape type="rectangle" id="floor"/>'
+        (folder / f"{name}.xml").write_text(f"{made}{floor}{plate.format(z=z)}{sun}</scene>")
+    corners = mi.traverse(mi.load_file("high.xml"))["plate.vertex_positions"]
+    job = {
+        "scene": "low.xml",
+        "parameters": [{"key": "sun.irradiance.value"}],
+        "target": {"values": {"plate.vertex_positions": np.array(corners).tolist()}, "spp": 64},
+    }
+    target = build_problem(make_config(job), Path()).views[0].target
+    path = mi.load_dict({"type": "path", "max_depth": 6})
+    assert target == pytest.approx(np.array(mi.render(mi.load_file("high.xml"), integrator=path, spp=64)), abs=0.03)
+
+
 def test_alpha_does_not_set_the_exposure() -> None:
     grey = np.full((HEIGHT, WIDTH, 1), 0.01, np.float32)
     with_alpha = np.concatenate([grey, np.ones_like(grey)], axis=2)

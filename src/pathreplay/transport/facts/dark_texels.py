@@ -28,5 +28,6 @@ class DarkTexels:
             for texels in with_gradients(emitter, name):
                 self._unexamined.remove(emitter)
                 if np.any(np.all(np.array(dr.detach(texels)) == 0, axis=-1)):
-                    self._known.append(f"'{name}' of emitter '{emitter.id()}'")
+                    shape = emitter.get_shape()
+                    self._known.append(f"'{name}' of emitter '{(emitter if shape is None else shape).id()}'")
         return tuple(self._known)
