@@ -166,6 +166,25 @@ def test_plastic_leaves_out_a_lobe_whose_whole_colour_is_black(
     assert len([line for line in log.lines if "diffuse_reflectance = 0 of" in line]) == count
 
 
+@pytest.mark.parametrize(
+    ("bsdf", "scale", "count"), [("conductor", 1.0, 1), ("conductor", 0.0, 0), ("diffuse", 1.0, 0)]
+)
+def test_a_script_is_told_of_suns_in_mirrors(bsdf: str, scale: float, count: int, log: Any) -> None:
+    sky = {"type": "sunsky", "sun_scale": scale, "sun_direction": [0, 1, -1]}
+    scene, key = make_scene(cube={"type": "cube", "bsdf": {"type": bsdf}}, sky=sky), "cube.vertex_positions"
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    with attached(scene, key):
+        dr.backward(dr.mean(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=1), axis=None))
+    assert len([line for line in log.lines if "sun's disc" in line]) == count
+
+
+def test_a_mesh_without_faces_is_refused() -> None:
+    corners = mi.Mesh("nothing", 3, 0)
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    with pytest.raises(PathreplayError, match="mesh 'nothing' has no faces, and cannot be traced: remove it"):
+        integrator.render(make_scene(nothing=corners), spp=1)
+
+
 def test_a_script_is_told_of_the_normals_of_curves(log: Any, tmp_path: Path) -> None:
     (tmp_path / "tube.txt").write_text("\n".join(f"{x / 2} {(x % 3) / 4} 0 0.2" for x in range(5)))
     tube = {"type": "bsplinecurve", "filename": str(tmp_path / "tube.txt")}

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import mitsuba as mi
+import numpy as np
 
 from pathreplay.boundary.observer import omitted_distance
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.edge_notes import edges_note, keys_that_move_edges
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.platform import compat
+from pathreplay.transport.facts.traits import SUNSKY
 from pathreplay.transport.vertex import TraceConfig
 
 COST_OF_EDGES = (
@@ -115,6 +117,17 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
         )
     if traits.detached_names:
         yield f"attach = 'all' keeps the directions of {', '.join(traits.detached_names)} fixed"
+
+
+def sun_note(trace: TraceConfig) -> str:
+    """Format the message about the disc of a sun that is seen in mirrors or glass; "" if there is none."""
+    skies = [light for light in trace.scene.emitters() if light.class_name() == SUNSKY]
+    if not trace.traits.mirrors or not any(np.any(np.array(mi.traverse(sky)["sun_scale"]) > 0) for sky in skies):
+        return ""
+    return (
+        "something moves in a scene with delta lobes and a sunsky: the motion of the edge of the sun's disc, which is "
+        "seen through glass or mirrors, is missing from the gradient; use a directional emitter and sun_scale = 0"
+    )
 
 
 def particle_doubts(trace: TraceConfig) -> Iterator[str]:

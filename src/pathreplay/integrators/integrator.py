@@ -28,6 +28,7 @@ from pathreplay.integrators.diagnostics import (
     offset_note,
     particle_doubts,
     particle_notes,
+    sun_note,
     used_before_note,
 )
 from pathreplay.integrators.film.camera_flow import CameraFlow
@@ -391,6 +392,8 @@ class PathReplayIntegrator(PathIntegrator):
         self.baseline = ref(facts_of(scene)), baseline
 
     def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
+        if result.moves and (note := sun_note(trace)):
+            self._warn_once(note)
         if self.particles is not None and result.moves:
             edges = self.boundary in ("auto", "all")
             omitted = ParticleBoundary(self.particles).notes(trace) if edges else None

@@ -7,6 +7,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.errors import PathreplayError
 from pathreplay.integrators.lifetimes import SCENES, is_recording
 from pathreplay.platform import compat
 from pathreplay.transport.facts.absent_lobes import AbsentLobes, ranges_of
@@ -43,6 +44,9 @@ class SceneFacts:
         self._traits = fixed_traits(nodes, scene)
         self._tables: Tables | None = None
         self._shapes = [node for node in nodes if isinstance(node, mi.Shape)]
+        for shape in self._shapes:
+            if is_mesh(shape) and shape.face_count() == 0:
+                raise PathreplayError(f"pathreplay: mesh '{shape.id()}' has no faces, and cannot be traced: remove it")
         self._boxes = [shape.bbox() for shape in self._shapes]
         self._faces = _faces(self._shapes)
         self._placed = scene.shapes()

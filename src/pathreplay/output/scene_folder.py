@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import re
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from pathreplay.platform.registration import PLUGINS
 from pathreplay.platform.threads import spare_thread
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import errors_as
-from pathreplay.scenes.parameters import get_array, is_empty, to_value
+from pathreplay.scenes.parameters import UNNAMED, get_array, is_empty, to_value
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
 from pathreplay.types import Json
@@ -41,9 +40,6 @@ _DEPTHS = {"direct_projective": 2} | dict.fromkeys(
 """Differentiable integrators and their default depths. Exported scenes have `path`, `volpath` or `ptracer` instead."""
 _KEPT = ("max_depth", "rr_depth", "hide_emitters")
 """Properties that `path`, `volpath` and `ptracer` share with differentiable integrators."""
-
-# Name that Mitsuba gives to an object without id; the number is a memory address.
-_ADDRESS = re.compile(r"object_\d+")
 
 
 @dataclass(frozen=True)
@@ -138,9 +134,9 @@ def require_same(original: mi.Scene, folder: Path) -> None:
     # Match objects without id by their order, which is the same in both scenes.
     waiting: defaultdict[str, list[str]] = defaultdict(list)
     for key in theirs.keys():
-        waiting[_ADDRESS.sub("object", key)].append(key)
+        waiting[UNNAMED.sub("object", key)].append(key)
     for key in ours.keys():
-        others = waiting[_ADDRESS.sub("object", key)]
+        others = waiting[UNNAMED.sub("object", key)]
         if not others or not _alike(ours[key], theirs[others.pop(0)]):
             raise PathreplayError(
                 f"Parameter '{key}' of {ours.properties[key][2].class_name()} is missing or different in the exported "

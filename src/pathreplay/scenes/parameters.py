@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
+import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 SceneValue: TypeAlias = "dr.ArrayBase | mi.Transform4f"
 """A differentiable value of `mi.SceneParameters`."""
+
+# Name that Mitsuba gives to an object without id; the number is a memory address.
+UNNAMED = re.compile(r"object_\d+")
 
 # Remedies for values that Mitsuba 3.9 stores without derivatives, by (class of the owner, last part of the key).
 _WAY_OUT = {
@@ -71,6 +75,19 @@ def resolve_keys(params: Mapping[str, object], patterns: str | Iterable[str], ow
             raise PathreplayError(_no_match(known, pattern, owner))
         selected.update(dict.fromkeys(matches))
     return list(selected)
+
+
+def require_ids(params: mi.SceneParameters, patterns: Iterable[str]) -> None:
+    """Raise PathreplayError if a glob in ``patterns`` matches a parameter of an object without id.
+
+    Mitsuba calls such an object by its address in memory. No other process could resume or export a run by this name.
+    """
+    for key, pattern in itertools.product(params.keys(), patterns):
+        if UNNAMED.match(key) and fnmatch.fnmatchcase(key, pattern):
+            raise PathreplayError(
+                f"'{pattern}' matches '{UNNAMED.sub('', key)[1:]}' of an object without id, by which a run cannot be "
+                'resumed or exported; give it an id in the scene file, for example id="light"'
+            )
 
 
 def keep_only(params: mi.SceneParameters, keys: Iterable[str]) -> None:

@@ -44,7 +44,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def problem_of(target: dict[str, Any], **more: Any) -> Problem:
-    job = {"scene": "room.xml", "parameters": [{"key": "ball.bsdf.reflectance.value"}], "target": target, **more}
+    job = {"scene": "room.xml", "parameters": [{"key": "ball.bsdf.reflectance.value"}], "target": target} | more
     return build_problem(make_config(job), Path())
 
 
@@ -243,6 +243,23 @@ def test_a_target_has_the_shadow_of_a_shape_that_has_left_the_scene(folder: Path
     target = build_problem(make_config(job), Path()).views[0].target
     path = mi.load_dict({"type": "path", "max_depth": 6})
     assert target == pytest.approx(np.array(mi.render(mi.load_file("high.xml"), integrator=path, spp=64)), abs=0.03)
+
+
+@pytest.mark.parametrize(("film", "way_out"), [("xyz", "rgb"), ("xyza", "rgba")])
+def test_films_that_store_xyz_are_refused(film: str, way_out: str, folder: Path) -> None:
+    """Targets are RGB images."""
+    (folder / "room.xml").write_text(scene(film))
+    mi.Bitmap(colours()).write("target.exr")
+    with pytest.raises(PathreplayError, match=f"'eye' has pixel_format = '{film}', .*; use '{way_out}'$"):
+        target_of("target.exr")
+
+
+def test_parameters_of_objects_without_id_are_refused(folder: Path) -> None:
+    """Their names are addresses in memory, which no other process knows."""
+    (folder / "room.xml").write_text(scene().replace(' id="sky"', ""))
+    mi.Bitmap(colours()).write("target.exr")
+    with pytest.raises(PathreplayError, match="of an object without id, by which a run"):
+        problem_of({"images": ["target.exr"]}, parameters=[{"key": "*.radiance.value"}])
 
 
 def test_alpha_does_not_set_the_exposure() -> None:

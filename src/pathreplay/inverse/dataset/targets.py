@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
@@ -302,7 +303,7 @@ def as_weight(what: str, mask: Image, name: str) -> Image:
 
 
 def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str, int]) -> None:
-    """Raise PathreplayError unless memory and kernel sizes suffice to render every sensor.
+    """Raise PathreplayError unless memory and kernel sizes suffice to render every sensor, and no film stores XYZ.
 
     Args:
         scene: the scene.
@@ -311,5 +312,11 @@ def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str,
     """
     pixels = 0
     for name, index in sensors.items():
+        if found := re.search("pixel_format = (xyza?)", str(scene.sensors()[index].film())):
+            format = "rgba" if found[1] == "xyza" else "rgb"
+            raise PathreplayError(
+                f"The film of sensor '{name}' has pixel_format = '{found[1]}', but targets and results are RGB images; "
+                f"use '{format}'"
+            )
         pixels += prod(film_size(scene.sensors()[index]))
         require_film(scene.sensors()[index], f"sensor '{name}'", spp, min(pixels * _A_VIEW, ROOM))

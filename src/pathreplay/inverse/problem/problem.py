@@ -356,6 +356,7 @@ def _loaded(
     wanted += [entry.key for entry in config.derived]
     cameras = {name: shot.camera for name, shot in shots.items()}
     scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
+    parameters.require_ids(traversed(scene), wanted)
     if config.capture is not None and config.capture.medium is not None:
         put_inside(scene, set(shots), config.capture.medium)
     config, differences = completed(config, scene, given.integrator)

@@ -62,5 +62,6 @@ class AbsentLobes:
                     names.remove(name)
                     values = np.concatenate([np.ravel(np.array(dr.detach(value))) for value in given])
                     ends = [end for end in ENDS[kind][name] if at_end(values == end)]
-                    self._known += [f"{name} = {end:g} of '{bsdf.id()}'" for end in ends]
+                    owner = f"'{bsdf.id()}'" if bsdf.id() else f"a {kind} without id"
+                    self._known += [f"{name} = {end:g} of {owner}" for end in ends]
         return tuple(self._known)
