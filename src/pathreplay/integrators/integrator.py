@@ -44,6 +44,7 @@ from pathreplay.integrators.path_integrator import UNBOUNDED, PathIntegrator, re
 from pathreplay.integrators.properties import choice, deviation, whole_number
 from pathreplay.integrators.scene_facts import SceneFacts, facts_of
 from pathreplay.integrators.term import Term, TermResult
+from pathreplay.transport.velocity import AT_COLLISIONS
 from pathreplay.transport.vertex import TraceConfig
 from pathreplay.types import Json
 
@@ -218,7 +219,12 @@ class PathReplayIntegrator(PathIntegrator):
         if not state.is_complete:
             tables = facts_of(view.scene).recorded_tables(state.tables, edges=True)
             trace = replace(trace, traits=replace(trace.traits, tables=tables))
-        return view, replace(trace, may_slide=self.boundary != "primary" and trace.media is None), (*terms, *motion)
+        if self.boundary != "primary":
+            if trace.media is None:
+                trace = replace(trace, may_slide=True)
+            elif not facts_of(view.scene).has_seams:
+                trace = replace(trace, blend_at_collisions=AT_COLLISIONS)
+        return view, trace, (*terms, *motion)
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
         """Return whether film positions may follow visible surfaces, which requires that all edges can be sampled."""

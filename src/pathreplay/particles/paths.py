@@ -230,9 +230,8 @@ def link_of(trace: TraceConfig, sensor: mi.Sensor, caustics: bool) -> TraceConfi
 
     A light path of ``max_depth`` segments has ``max_depth`` - 1 vertices, because neither emitter nor sensor counts as
     a vertex. With ``caustics``, only the paths that `TraceConfig.without_caustics` omits are traced. Directions from
-    smooth lobes follow their hit points, because no boundary term follows a smooth lobe (`TraceConfig.may_slide`).
+    smooth lobes and collisions follow their hit points, because no boundary term follows a smooth lobe or a collision.
     """
     link = replace(SensorLink.of(sensor), caustics=caustics)
-    return replace(
-        trace, to_sensor=link, max_depth=max(trace.max_depth - 1, 0), without_caustics=False, may_slide=False
-    )
+    trace = replace(trace, to_sensor=link, max_depth=max(trace.max_depth - 1, 0), without_caustics=False)
+    return replace(trace, may_slide=False, blend_at_collisions=1.0)

@@ -284,7 +284,8 @@ def _at_particle(
         shape = shape_met(trace, hit_next, ray, active)
         seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
         holds = active & hit_next.is_valid() & seen & ~is_seen_through(trace, hit_next, ray)
-        d, J = moved_direction(trace.traits.tables.blend_lengths, v.origin, kept.d, hit_next, holds)
+        lengths, scale = trace.traits.tables.blend_lengths, trace.blend_at_collisions
+        d, J = moved_direction(lengths, v.origin, kept.d, hit_next, holds, scale)
     f, pdf = v.inside.phase.eval_pdf(mi.PhaseFunctionContext(None), v.inside.mei, d, active)
     pdf = dr.replace_grad(kept.pdf, dr.select(active, pdf, 0)) if attached else kept.pdf
     return f * J * dr.detach(reciprocal(kept.pdf)), d, pdf

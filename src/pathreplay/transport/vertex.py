@@ -49,6 +49,8 @@ class TraceConfig:
     may_slide: bool = False
     """Whether boundary terms are estimated. Some directions sampled from smooth lobes are then fixed, although edges
     may move across them (see `keeps_direction` and `is_seen_through` in `scatter`)."""
+    blend_at_collisions: float = 1.0
+    """Factor of `velocity.blend_length` for directions from collisions in a medium: see `velocity.AT_COLLISIONS`."""
 
     # Light paths.
     to_sensor: SensorLink | None = None
