@@ -33,8 +33,6 @@ ALL = "boundary alone"
 #: Around which axis vertices turn, by scene.
 AXES = {"shadow": (0, 0, 1)}
 UPRIGHT = (0, 1, 0)
-#: Of finite differences.
-PICTURES = {"type": "path"}
 
 
 class Nothing:
@@ -126,7 +124,7 @@ class NumberPass:
 
     A gradient pass has ``job.spp`` samples per pixel. A central difference uses two images with ``job.spp`` samples per
     pixel each and common random numbers. Both methods use their usual settings: `pathreplay` its own samples, and the
-    images Mitsuba's `path`.
+    images Mitsuba's `path`, or `volpath` in fog.
     """
 
     def __init__(self, job: Job) -> None:
@@ -134,13 +132,15 @@ class NumberPass:
         scene = mi.load_dict(self.mover.scene(job.resolution), optimize=False)
         (key,) = job.parameters
         self.objective = Objective(scene, mi.traverse(scene), key, self.mover.move)
+        fog = any(shape.is_medium_transition() for shape in scene.shapes())
+        self.pictures = {"type": "volpath" if fog else "path"}
         self.objective.weigh(smooth_weights((job.resolution, job.resolution, 3), alpha=False))
         self.forget()
 
     def forget(self) -> None:
         """Replace all integrators by new ones."""
         self.integrators: dict[str, Any] = {
-            name: mi.load_dict((PICTURES if name == DIFFERENCE else METHODS[name]) | self.job.limits)
+            name: mi.load_dict((self.pictures if name == DIFFERENCE else METHODS[name]) | self.job.limits)
             for name in self.job.methods
         }
 

@@ -192,6 +192,11 @@ def _rough_glass() -> SceneDict:
     return {"type": "cube", "to_world": T().translate([0, 0, 1.2]).scale([1.2, 1.2, 0.1]), "bsdf": glass}
 
 
+def _fog(extinction: float) -> SceneDict:
+    medium = {"type": "homogeneous", "sigma_t": extinction, "albedo": 0.8}
+    return {"type": "cube", "to_world": T().scale(0.9), "bsdf": {"type": "null"}, "interior": medium}
+
+
 def _textured_ball() -> SceneDict:
     return _ball([0, 0, 0], 0.8, {"type": "diffuse", "reflectance": _texture(0.1, 0.9)})
 
@@ -211,6 +216,12 @@ MOVERS: dict[str, Mover] = {
     "between walls": Mover(_scene(wall=_wall, floor=_floor, object=_box, lamp=_lamp), _slide_vertices),
     "ball lifts off": Mover(
         _scene(_above, floor=_floor, object=lambda: _ball([0, 0, 0], 0.5), lamp=_lamp, sky=lambda: SKY), _slide(0, 1, 0)
+    ),
+    "ball in fog": Mover(
+        _scene(wall=_wall, object=lambda: _ball([0, 0, 0], 0.4), lamp=_lamp, fog=lambda: _fog(1.5)), _slide(1, 0.3, 0)
+    ),
+    "ball in thick fog": Mover(
+        _scene(object=lambda: _ball([0, 0, 0], 0.4), sky=lambda: SKY, fog=lambda: _fog(4.0)), _slide(1, 0.3, 0)
     ),
     "small in a room": Mover(
         _scene(_above, floor=_floor, wall=_wall, object=lambda: _ball([0.3, -0.3, 0.5], 0.06), lamp=_lamp),

@@ -51,6 +51,8 @@ MOVING = {
     "behind rough glass": (*KEY, 5),
     "between walls": (*KEY, 6),
     "ball lifts off": (PLACE, 3),
+    "ball in fog": (PLACE, 5),
+    "ball in thick fog": (PLACE, 5),
     "small in a room": (PLACE, 3),
 }
 """Scenes for derivatives with respect to one number: the key of the moving parameter, and the depth."""
