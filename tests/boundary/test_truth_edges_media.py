@@ -48,3 +48,15 @@ def test_gradients_with_edges_agree(name: str) -> None:
     assert abs(row.z) < Z_LIMIT, row
     assert row.error < RESOLUTION * max(abs(row.gradient), abs(row.reference)), row
     assert row.transpose < TRANSPOSE_MAX, row
+
+
+@pytest.mark.slow
+def test_edges_in_thick_fog_are_less_noisy_than_differences() -> None:
+    """Of as many samples. If both sides of an edge sample their flights up to it, the ratio is 4."""
+    with loaded("thick_fog") as bench:
+        differences = bench.reference(32, spp=bench.case.spp // 2)
+        bench.put(dr.opaque(mi.Float, 0))
+        gradients = bench.backwards(bench.integrator(rr_depth=bench.case.rr_depth), 32)
+    ratio = gradients.var() / differences.var()
+    print(f"variance of gradients over that of differences: {ratio:.2f}")
+    assert ratio < 1

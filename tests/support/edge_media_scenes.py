@@ -159,6 +159,11 @@ def spot_in_smoke() -> dict:
     return in_fog({"type": "homogeneous", "sigma_t": 0.1, "albedo": 0.0}, wall=shape(BACK, plain()), lamp=spot)
 
 
+def ball_in_thick_fog() -> dict:
+    medium, ball = homogeneous(4.0, 0.8), {"type": "sphere", "to_world": T().translate([0.1, 0, -0.1]).scale(0.35)}
+    return in_a_box(medium, object=ball, wall=lamp(BEHIND, 2), lamp=lamp(OVERHEAD))
+
+
 def media_cell(name: str, make: Callable[[], dict], key: str, move: Move, depth: int = 3, **more: Any) -> Case:
     return cell(name, make, key, move, depth, **{"reference": "volpath", "spp": 128, **more})
 
@@ -180,6 +185,7 @@ CELLS = [
     media_cell("by_ball", lamp_by_a_ball, "lamp.to_world", translate(-1, 0, 0), 2),
     media_cell("fog_mirror", mirror_in_fog, "mirror.to_world", translate(0, 0, 1)),
     media_cell("spot_border", spot_in_smoke, "lamp.to_world", translate(1, 0.3, 0), 2),
+    media_cell("thick_fog", ball_in_thick_fog, OBJECT, translate(1, 0.4, 0.2), 5, spp=64, step=2e-2),
     media_cell("indirect", indirect_in_smoke, OBJECT, translate(1, 0.3, 0.4), spp=256, seeds=24),
     media_cell("indirect_box", partial(indirect_in_smoke, True), OBJECT, translate(1, 0.3, 0.4), spp=256, seeds=24),
 ]

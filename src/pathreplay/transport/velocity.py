@@ -43,8 +43,8 @@ from pathreplay.transport.surface import SurfacePoint, solid_angle, surface_poin
 # larger value also omits more of the derivative due to moving edges nearby. docs/gradients.md has measurements for
 # 0.003 to 0.03.
 BLEND = 0.01
-# Factor of h0 if x is a collision in a medium, and the boundary term finds the edges that V then omits. `pathreplay bench
-# edges` measures the noise of a ball that moves in fog.
+# Factor of h0 if x is a collision in a medium, and the boundary term finds the edges that V then omits.
+# `pathreplay bench edges` measures the noise of a ball that moves in fog.
 AT_COLLISIONS = 10.0
 # Value of m (see the module docstring) above which the velocity V equals V_H to within 0.1 %.
 CLOSE = 7.0
