@@ -149,16 +149,16 @@ class ObserverVertex:
         self.at, self.flight, self.active = at, flight, active = vertex.at, vertex.flight, vertex.active
         self.origin: mi.Interaction3f
         self.si: mi.SurfaceInteraction3f
-        self.blend_scale: mi.Float | float = 1  # factor of `velocity.blend_length`
         if trace.media is None:
             self.origin = self.si = at.hit.compute_surface_interaction(at.ray, compat.shading(), active)
         else:
             # With a given flight, no random numbers are needed, and the sampler may be None.
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-            self.blend_scale = dr.select(self.event, mi.Float(trace.blend_at_collisions), 1)
         # In lanes with `keeps_direction`, sampled directions are fixed, and creases count as edges.
         self.keeps_direction = scatter.keeps_direction(trace, self.si, active)
+        if trace.holds_collisions:
+            self.keeps_direction |= self.event
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
         """Return the vertex, differentiable in the arriving ``ray`` and in the surface or medium.
@@ -239,8 +239,7 @@ class ObserverVertex:
         It is differentiable in ``at``, the vertex (see `moved`), and in the shape that was hit.
         """
         holds = self.holds(hit, ray, active)
-        lengths = self.trace.traits.tables.blend_lengths
-        d, _ = moved_direction(lengths, at, ray.d, hit, holds, self.blend_scale)
+        d, _ = moved_direction(self.trace.traits.tables.blend_lengths, at, ray.d, hit, holds)
         moved = mi.Ray3f(ray)
         moved.o, moved.d = at.spawn_ray(dr.detach(d)).o, d
         return moved
@@ -254,21 +253,21 @@ class ObserverVertex:
 
     def edge_surfaces(
         self, rays: list[mi.Ray3f], firsts: list[mi.PreliminaryIntersection3f], active: mi.Bool
-    ) -> list[mi.PreliminaryIntersection3f]:
-        """Return the hits that form the edge between two rays.
+    ) -> tuple[list[mi.PreliminaryIntersection3f], mi.Bool]:
+        """Return the hits that form the edge between two rays, and a mask.
 
-        If both rays first hit the same null boundary, they are the hits behind the boundary. Otherwise, they are the
-        first hits ``firsts``.
+        The mask contains the lanes in which both rays first hit the same null boundary. In these lanes, the result has
+        the hits behind the boundary. In all other lanes, it has the first hits ``firsts``.
         """
         if self.trace.media is None:
-            return firsts
+            return firsts, mi.Bool(False)
         shapes = [shape_met(self.trace, first, ray, active) for ray, first in zip(rays, firsts, strict=True)]
         places = [
             place_met(self.trace, *met, facets=False) for met in zip(firsts, (active, active), shapes, strict=True)
         ]
         through = (places[0] == places[1]) & firsts[0].is_valid() & is_null(shapes[0].bsdf())
         pairs = zip(rays, firsts, strict=True)
-        return [dr.select(through, self.behind(ray, first, active), first) for ray, first in pairs]
+        return [dr.select(through, self.behind(ray, first, active), first) for ray, first in pairs], through
 
     def medium(self, d: mi.Vector3f) -> mi.MediumPtr:
         """Return the medium in direction ``d``; None in scenes without media."""

@@ -57,9 +57,8 @@ class ArcSegment(Arc):
         place = dr.select(
             observer.keeps_direction, *(place_met(trace, seen, active, at.shape, facets) for facets in (True, False))
         )
-        lengths, scale = trace.traits.tables.blend_lengths, observer.blend_scale
-        facets = jumps_at_facets(lengths, observer.origin, seen, at.p, at.n, scale)
-        facets &= close & ~observer.keeps_direction
+        lengths = trace.traits.tables.blend_lengths
+        facets = close & ~observer.keeps_direction & jumps_at_facets(lengths, observer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         near = closeness(trace, seen)
         if trace.media is not None:
@@ -106,7 +105,7 @@ class ArcSegment(Arc):
         active = bracket.weight > 0
         rays = [observer.origin.spawn_ray(self.at(t)) for t in (bracket.a, bracket.b)]
         firsts = [observer.hit(ray, active) for ray in rays]
-        edges = observer.edge_surfaces(rays, firsts, active)
+        edges, through = observer.edge_surfaces(rays, firsts, active)
         near_a, shadow = edges[0].t <= edges[1].t, None
         if self.hard:
             a, b = (self._probe(t, active, hard=False) for t in (bracket.a, bracket.b))
@@ -119,10 +118,12 @@ class ArcSegment(Arc):
         active = active & near.edge.is_valid() & observer.is_far(near.edge.t)
         crease = Crease.of(trace, (near.edge, near.ray), (far.edge, far.ray), shadow, active)
         edge = OcclusionEdge.of(observer, near, far, crease, active)
-        K_near, K_far = self._weights(bracket, edge, near, far)
+        K_near, K_far = self._weights(bracket, edge, near, far, through)
         return [HeldEdge(K_far - K_near, edge), MovedSide(K_near, edge, near), MovedSide(-K_far, edge, far)]
 
-    def _weights(self, bracket: Bracket, edge: OcclusionEdge, near: Side, far: Side) -> tuple[mi.Spectrum, mi.Spectrum]:
+    def _weights(
+        self, bracket: Bracket, edge: OcclusionEdge, near: Side, far: Side, through: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Spectrum]:
         """Return the Crofton weights π/2 f / (l p(c)) of both sides (see `crofton`).
 
         f is the integrand on the near or on the far side. It is estimated with the same random numbers on both sides.
@@ -134,7 +135,10 @@ class ArcSegment(Arc):
         at_near, at_far = (observer.arrival(side.ray, side.hit, pdf) for side in (near, far))
         arrivals = off_contact(trace, at_near, at_far, active)
         L, depth, shadow = [], x.depth + 1, edge.crease.shadow
-        T, arrivals = observer.onward(arrivals, SHORT_OF * near.edge.t, self.key, active)
+        # The light that is scattered into the rays before the edge cancels if directions move alike on both sides.
+        alike = through | observer.keeps_direction
+        alike = alike if shadow is None else alike | shadow.exists
+        T, arrivals = observer.onward(arrivals, SHORT_OF * near.edge.t, self.key, active & alike)
         for arrival in arrivals:
             path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < trace.max_depth))
             L.append(path_radiance(trace, CounterSampler.stream(self.key, Stream.BEYOND_EDGE), path)[0])

@@ -44,7 +44,6 @@ from pathreplay.integrators.path_integrator import UNBOUNDED, PathIntegrator, re
 from pathreplay.integrators.properties import choice, deviation, whole_number
 from pathreplay.integrators.scene_facts import SceneFacts, facts_of
 from pathreplay.integrators.term import Term, TermResult
-from pathreplay.transport.velocity import AT_COLLISIONS
 from pathreplay.transport.vertex import TraceConfig
 from pathreplay.types import Json
 
@@ -220,10 +219,8 @@ class PathReplayIntegrator(PathIntegrator):
             tables = facts_of(view.scene).recorded_tables(state.tables, edges=True)
             trace = replace(trace, traits=replace(trace.traits, tables=tables))
         if self.boundary != "primary":
-            if trace.media is None:
-                trace = replace(trace, may_slide=True)
-            elif not facts_of(view.scene).has_seams:
-                trace = replace(trace, blend_at_collisions=AT_COLLISIONS)
+            fog = trace.media is not None
+            trace = replace(trace, may_slide=not fog, holds_collisions=fog and not facts_of(view.scene).has_seams)
         return view, trace, (*terms, *motion)
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:

@@ -234,4 +234,4 @@ def link_of(trace: TraceConfig, sensor: mi.Sensor, caustics: bool) -> TraceConfi
     """
     link = replace(SensorLink.of(sensor), caustics=caustics)
     trace = replace(trace, to_sensor=link, max_depth=max(trace.max_depth - 1, 0), without_caustics=False)
-    return replace(trace, may_slide=False, blend_at_collisions=1.0)
+    return replace(trace, may_slide=False, holds_collisions=False)

@@ -275,17 +275,17 @@ def _at_particle(
     """Evaluate again the weight, direction and density of a continuation that starts at a collision in a medium.
 
     If the next surface scatters or emits light, the direction follows the hit point, because such a surface may have
-    edges and texture seams. Towards any other surface, the direction is constant, which is less noisy.
+    edges and texture seams. Towards any other surface, the direction is constant, which is less noisy. With
+    `TraceConfig.holds_collisions`, every direction is constant.
     """
     kept, hit_next = again.kept, again.hit_next
     d, J = kept.d, mi.Float(1)
-    if attached:
+    if attached and not trace.holds_collisions:
         ray = dr.detach(v.origin.spawn_ray(kept.d))
         shape = shape_met(trace, hit_next, ray, active)
         seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
         holds = active & hit_next.is_valid() & seen & ~is_seen_through(trace, hit_next, ray)
-        lengths, scale = trace.traits.tables.blend_lengths, trace.blend_at_collisions
-        d, J = moved_direction(lengths, v.origin, kept.d, hit_next, holds, scale)
+        d, J = moved_direction(trace.traits.tables.blend_lengths, v.origin, kept.d, hit_next, holds)
     f, pdf = v.inside.phase.eval_pdf(mi.PhaseFunctionContext(None), v.inside.mei, d, active)
     pdf = dr.replace_grad(kept.pdf, dr.select(active, pdf, 0)) if attached else kept.pdf
     return f * J * dr.detach(reciprocal(kept.pdf)), d, pdf

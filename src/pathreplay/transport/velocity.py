@@ -26,8 +26,7 @@ h, but different r and k. For a change δd of the direction,
 The factor r in m keeps V close to V_H at distant hit points on a near plane. Such points may lie on edges. The cost in
 variance is small, because only a few directions, all at grazing angles, reach such points. For a sphere, h is the
 distance from x to the sphere, which is also independent of d. This distance does not vanish at the silhouette. On other
-curved shapes, m is infinite. If x is in a medium, it has no normal: q is infinite, and V_D = 0. Collisions often occur
-close to a surface, so a larger h0 reduces the noise. It is used if boundary terms find the edges that V then omits.
+curved shapes, m is infinite. If x is in a medium, it has no normal: q is infinite, and V_D = 0.
 """
 
 from __future__ import annotations
@@ -43,9 +42,6 @@ from pathreplay.transport.surface import SurfacePoint, solid_angle, surface_poin
 # larger value also omits more of the derivative due to moving edges nearby. docs/gradients.md has measurements for
 # 0.003 to 0.03.
 BLEND = 0.01
-# Factor of h0 if x is a collision in a medium, and the boundary term finds the edges that V then omits.
-# `pathreplay bench edges` measures the noise of a ball that moves in fog.
-AT_COLLISIONS = 10.0
 # Value of m (see the module docstring) above which the velocity V equals V_H to within 0.1 %.
 CLOSE = 7.0
 
@@ -57,18 +53,13 @@ def blend_length(shape: mi.Shape) -> float:
 
 
 def moved_direction(
-    lengths: mi.Float,
-    origin: mi.Interaction3f,
-    d: mi.Vector3f,
-    hit: mi.PreliminaryIntersection3f,
-    active: mi.Bool,
-    scale: mi.Float | float = 1,
+    lengths: mi.Float, origin: mi.Interaction3f, d: mi.Vector3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Float]:
     """Return the recorded direction ``d``, and J = 1, with the derivatives that the field V prescribes.
 
-    ``lengths`` contains the `blend_length` of each shape, and h0 is ``scale`` times this length. ``hit`` is the
-    intersection of the continuation from ``origin`` along ``d``. Rays that leave the scene have a constant direction.
-    Differentiable in ``origin`` and in the shape that was hit.
+    ``lengths`` contains the `blend_length` of each shape, and ``hit`` is the intersection of the continuation from
+    ``origin`` along ``d``. Rays that leave the scene have a constant direction. Differentiable in ``origin`` and in the
+    shape that was hit.
     """
     valid = active & hit.is_valid()
     y = surface_point(hit, dr.detach(origin.spawn_ray(d)), valid)
@@ -77,7 +68,7 @@ def moved_direction(
     ok, dist2, log_J_H = solid_angle(y, start, valid)
     d_H = towards * dr.rsqrt(dist2)
 
-    h0 = scale * blend_length_at(lengths, hit, ok)
+    h0 = blend_length_at(lengths, hit, ok)
     n_x = dr.detach(origin.n)
     d_D = dr.cross(dr.cross(n_x, origin.n), dr.detach(d))  # its derivative is V_D
     φ, slope = _share(h0, dr.detach(y), n_x, dr.detach(towards), ok)
@@ -92,20 +83,14 @@ def blend_length_at(lengths: mi.Float, hit: mi.PreliminaryIntersection3f, active
 
 
 def jumps_at_facets(
-    lengths: mi.Float,
-    origin: mi.Interaction3f,
-    hit: mi.PreliminaryIntersection3f,
-    p: mi.Point3f,
-    n: mi.Normal3f,
-    scale: mi.Float | float = 1,
+    lengths: mi.Float, origin: mi.Interaction3f, hit: mi.PreliminaryIntersection3f, p: mi.Point3f, n: mi.Normal3f
 ) -> mi.Bool:
     """Return whether V jumps between the triangle at ``hit`` and the adjacent triangles of the mesh.
 
-    ``p`` and ``n`` are position and normal at the hit, and ``scale`` is that of `moved_direction`. Near the surface, φ
-    depends on the plane of the triangle.
+    ``p`` and ``n`` are position and normal at the hit. Near the surface, φ depends on the plane of the triangle.
     """
     towards = p - origin.p
-    near = dr.abs(dr.dot(n, towards)) * dr.norm(towards) < CLOSE * dr.square(scale * blend_length_at(lengths, hit))
+    near = dr.abs(dr.dot(n, towards)) * dr.norm(towards) < CLOSE * dr.square(blend_length_at(lengths, hit))
     return hit.is_valid() & (hit.shape.is_mesh() | (hit.instance != None)) & near  # noqa: E711 (an array of pointers)
 
 

@@ -49,8 +49,9 @@ class TraceConfig:
     may_slide: bool = False
     """Whether boundary terms are estimated. Some directions sampled from smooth lobes are then fixed, although edges
     may move across them (see `keeps_direction` and `is_seen_through` in `scatter`)."""
-    blend_at_collisions: float = 1.0
-    """Factor of `velocity.blend_length` for directions from collisions in a medium: see `velocity.AT_COLLISIONS`."""
+    holds_collisions: bool = False
+    """Whether directions from collisions in a medium are fixed. Boundary terms must then be estimated, and no texture
+    may have discontinuities. The two sides of an edge that a collision sees can then share the transmittance."""
 
     # Light paths.
     to_sensor: SensorLink | None = None
