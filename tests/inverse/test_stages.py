@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +74,6 @@ def test_a_stage_computes_what_a_job_of_its_own_does(integrator: str) -> None:
 
 
 def _with(problem: Any, views: tuple[View, ...]) -> Any:
-    from dataclasses import replace
-
     return replace(problem, views=views)
 
 
@@ -140,6 +139,13 @@ def test_stages_choose_views_and_batches() -> None:
     assert [view.name for view in one.problem.trained().values()] == ["right"]
     assert two.problem.config.view_batch_size == 1 and len(two.problem.trained()) == 2
     assert part_at(problem, 99).number == 1
+
+
+def test_the_loss_of_a_stage_is_a_mean_over_its_weighted_views() -> None:
+    config = staged(view_weights={"left": 9.0}, stages=[{"iterations": 1, "sensors": ["left"]}, {"iterations": 1}])
+    problem = build_problem(config, Path.cwd())
+    shares = [[view.share for view in part_at(problem, i).problem.trained().values()] for i in (0, 1)]
+    assert shares[0] == pytest.approx([1]) and shares[1] == pytest.approx([1.8, 0.2])
 
 
 GRID = {"parameters": [{"key": TEXTURE, "initial": 0.5, "resolutions": [2, 3, 4]}, {"key": FLOOR, "initial": 0.5}]}

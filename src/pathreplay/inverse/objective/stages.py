@@ -55,7 +55,11 @@ def _part(problem: Problem, number: int, stage: Stage) -> Part:
     names = "spp", "view_batch_size", "pixel_batch_size"
     given = {name: value for name in names if (value := getattr(stage, name)) is not None}
     seen = _views(problem, stage)
-    views = tuple(replace(v, is_test=v.is_test or (seen is not None and v.name not in seen)) for v in problem.views)
+    views = problem.views
+    if seen is not None:
+        # The weights of the stage's views have the mean 1, like those of all training views.
+        mean = float(np.mean([view.share for view in views if view.name in seen]))
+        views = tuple(replace(v, is_test=v.name not in seen, share=v.share / mean) for v in views)
     moving = frozenset(_moving(problem, stage))
     config = problem.config.model_copy(update=given)
     return Part(number, stage, replace(problem, views=views, config=config), moving)
