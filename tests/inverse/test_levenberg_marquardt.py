@@ -179,6 +179,21 @@ def test_it_goes_on_bit_for_bit_from_everywhere(noise: float) -> None:
             assert bits(other.answer({})) == bits(points[-1]) or other.answer({}) == {}
 
 
+def test_a_run_that_ended_by_its_tolerance_goes_on_with_a_lower_one() -> None:
+    """It then takes the steps of a run that had the lower tolerance from the beginning."""
+    coarse, fine = (Optimizer(type="levenberg-marquardt", tolerance=tolerance) for tolerance in (1e-3, 2e-6))
+    whole = [START, *go(optimiser(options=fine), START, 60, noise=0.1)]
+    one, same, other = (optimiser(options=options) for options in (coarse, coarse, fine))
+    points = [START, *go(one, START, 60, noise=0.1)]
+    done = len(points) - 1
+    assert one.finished and done + 5 < len(whole) - 1
+    same.restore(one.state(), points[-1])
+    other.restore(one.state(), points[-1])
+    assert same.finished == one.finished and not other.finished
+    rest = go(other, points[-1], 60, noise=0.1)
+    assert [bits(p) for p in points + rest] == [bits(p) for p in whole] and other.finished
+
+
 def test_a_state_that_does_not_fit_is_refused() -> None:
     search = optimiser()
     go(search, START, 5)

@@ -64,7 +64,7 @@ ROUNDING = 1e-6
 """Relative error of losses in single precision."""
 
 _CONTROLS = "loss", "excess", "damping", "growth", "predicted", "first"
-_COUNTS = "rejections", "stalls", "count", "far", "restarts", "draw", "ended"
+_COUNTS = "rejections", "stalls", "count", "far", "restarts", "draw"
 _ARRAYS = "at", "gradient", "matrix", "robust", "bias", "noise", "spread"
 _NAMES = {name: f"levenberg:{name}" for name in (*_ARRAYS, "numbers", "next")}
 REASON = "the noise of the values affects the loss less than the tolerance"
@@ -268,13 +268,14 @@ class LevenbergMarquardt(VectorOptimiser):
             return State(steps, {})
         model = self._base.model
         controls = self._base.loss, model.excess, self._damping, self._growth, self._predicted, self._first
-        counts = self._rejections, self._stalls, self._count, self._far, self._restarts, self.draw, bool(self.finished)
+        counts = self._rejections, self._stalls, self._count, self._far, self._restarts, self.draw
         matrices = model.matrix, model.robust, model.bias, model.noise
         arrays = (self._base.at, self._base.gradient, *matrices, model.spread)
         named = dict(zip(_NAMES, (*arrays, np.array([*controls, *counts], float), self._next), strict=True))
         return State(steps, {_NAMES[name]: array for name, array in named.items()})
 
     def restore(self, state: State, values: Arrays) -> None:
+        """See `Optimiser`. A search that has finished goes on if the tolerance is now lower."""
         count = self._steps_of(state, values, _NAMES.values())
         self._reset()
         self._steps = count
@@ -291,14 +292,15 @@ class LevenbergMarquardt(VectorOptimiser):
             : len(_CONTROLS)
         ].tolist()
         counts = saved["numbers"][len(_CONTROLS) :].astype(int).tolist()
-        self._rejections, self._stalls, self._count, self._far, self._restarts, self.draw, ended = counts
+        self._rejections, self._stalls, self._count, self._far, self._restarts, self.draw = counts
         if self._damping <= 0:
             raise ValueError("its damping is not positive")
-        self.finished = REASON if ended else ""
         matrix, robust, bias, noise, spread = (saved[name] for name in _ARRAYS[2:])
         model = GaussNewton(self._sizes, matrix, robust, bias, noise, spread, excess)
         self._base = Point(saved["at"], loss, saved["gradient"], model)
         self._next = saved["next"]
+        if self._count:
+            self._end()
 
 
 def _positive(model: GaussNewton) -> Matrix:
