@@ -244,6 +244,22 @@ def test_a_job_that_was_left_goes_on_bit_for_bit(wall_room: Path) -> None:
         assert cut.parameters[KEY].tobytes() == whole.parameters[KEY].tobytes()
 
 
+@pytest.mark.parametrize("transform", [None, "logit"])
+def test_a_job_that_ended_goes_on_with_a_lower_tolerance(transform: str | None, wall_room: Path) -> None:
+    """It then is the job that had the lower tolerance from the beginning, bit for bit."""
+    entry = ENTRY if transform is None else {**ENTRY, "parameterization": transform}
+    job = {**SEARCHED, "parameters": [entry], "optimizer": {"type": "l-bfgs-b", "tolerance": 1e-6}}
+    whole = optimize(make_config({**job, "output": "whole"}), progress=False)
+    coarse = {**job, "optimizer": {"type": "l-bfgs-b", "tolerance": 0.2}, "output": "run"}
+    first = optimize(make_config(coarse), progress=False)
+    assert first.iterations < whole.iterations - 1 and not first.stopped
+    config = Path("run/config.json")
+    config.write_text(config.read_text().replace('"tolerance": 0.2', '"tolerance": 1e-6'))
+    again = optimize(resume="run", progress=False)
+    assert saved("run") == saved("whole") and again.iterations == whole.iterations
+    assert again.parameters[KEY].tobytes() == whole.parameters[KEY].tobytes()
+
+
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "stages": ({"stages": [{"iterations": 40}]}, "remove 'stages'"),
     "batches": ({"view_batch_size": 1}, "remove 'view_batch_size'"),

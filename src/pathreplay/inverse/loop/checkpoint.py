@@ -19,7 +19,7 @@ from pathreplay.inverse.objective.evaluate import Executor
 from pathreplay.inverse.optim.adaptive import Optimiser, State, WhenAsked
 from pathreplay.inverse.parameters.grids import Levels
 from pathreplay.inverse.parameters.values import Array, Arrays
-from pathreplay.inverse.parameters.variables import Variable, latents
+from pathreplay.inverse.parameters.variables import Variable, decoded, latents
 from pathreplay.platform.atomic_files import Content
 
 
@@ -147,7 +147,9 @@ def restore(path: Path, run: Run, variables: Sequence[Variable], held: Collectio
                 f"Checkpoint {path} has no state of this optimizer ({error}); resume with the optimizer of the run, or "
                 "start a new run"
             ) from None
-        run.values, run.history, run.learned = values, history, learned
+        # A search that had ended has its best point as values, but may go on at another point.
+        run.values = decoded(variables, run.optimiser.awaited(), values)
+        run.history, run.learned = history, learned
         return
     except ValidationError as error:
         first = error.errors()[0]

@@ -53,7 +53,7 @@ from pathreplay.inverse.parameters.exposures import EXPOSURE, exposed, with_held
 from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.mesh import Surface
 from pathreplay.inverse.parameters.values import Array, Arrays
-from pathreplay.inverse.parameters.variables import latent_bounds, latents
+from pathreplay.inverse.parameters.variables import decoded, latent_bounds, latents
 from pathreplay.inverse.problem.problem import Problem, detach, errors_of, put_values, sensor_of
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
@@ -124,12 +124,7 @@ def best_values(problem: Problem, run: Run) -> dict[str, Array]:
 
     They differ if the optimiser compares losses or averages its iterates (see `Optimiser.answer`).
     """
-    best = run.optimiser.answer(latents(problem.variables, run.values))
-    for v in problem.variables:
-        if v.coordinates and v.key in best:
-            best[v.key] = v.coordinates.values(best[v.key])
-    # `run.values` are within their bounds already.
-    return {v.key: np.clip(best[v.key], *v.bounds) if v.key in best else run.values[v.key] for v in problem.variables}
+    return decoded(problem.variables, run.optimiser.answer(latents(problem.variables, run.values)), run.values)
 
 
 def iterate(problem: Problem, run: Run, stop: Stop) -> Generator[Event, None, None]:

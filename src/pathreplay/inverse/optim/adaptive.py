@@ -68,6 +68,13 @@ class Optimiser(Protocol):
         """
         return {}
 
+    def awaited(self) -> dict[str, Array]:
+        """Return the values that the next step must get. Variables that are missing keep their current values.
+
+        The result is empty, unless a search that had ended goes on after `restore`: the values are then its best point.
+        """
+        return {}
+
     def state(self) -> State:
         """Return all state that later steps depend on, besides the values."""
 

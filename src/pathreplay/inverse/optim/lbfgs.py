@@ -68,6 +68,8 @@ class LineSearch(VectorOptimiser):
         self._points: list[Vector] = []
         self._losses: list[float] = []
         self._gradients: list[Vector] = []
+        self._goes_on = False
+        """Whether the search had ended, and goes on since it was restored with a lower tolerance."""
 
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
@@ -78,6 +80,7 @@ class LineSearch(VectorOptimiser):
         if not self._losses:
             self._scale = np.concatenate([np.full(value.size, rates[key]) for key, value in values.items()])
             self._start = flat(values) / self._scale
+        self._goes_on = False
         self._losses.append(float(loss))
         self._gradients.append(flat({key: gradients[key] for key in values}) * self._scale)
         self._ask()
@@ -120,6 +123,9 @@ class LineSearch(VectorOptimiser):
             return {}
         return split(self._points[int(np.argmin(self._losses))] * self._scale, self._shapes)
 
+    def awaited(self) -> dict[str, Array]:
+        return split(self._next * self._scale, self._shapes) if self._goes_on else {}
+
     def state(self) -> State:
         """See `Optimiser`. The state consists of start, scales, recorded evaluations and next point."""
         steps = dict.fromkeys(self._shapes, len(self._losses))
@@ -138,7 +144,7 @@ class LineSearch(VectorOptimiser):
     def restore(self, state: State, values: Arrays) -> None:
         n = self._n
         count = self._steps_of(state, values, {_START, _SCALE, _LOSSES, _GRADIENTS, _NEXT})
-        self.finished, self._points, self._losses, self._gradients = "", [], [], []
+        self.finished, self._points, self._losses, self._gradients, self._goes_on = "", [], [], [], False
         if not count:
             return
         shapes = {_START: (n,), _SCALE: (n,), _LOSSES: (count,), _GRADIENTS: (count, n), _NEXT: (n,)}
@@ -153,6 +159,7 @@ class LineSearch(VectorOptimiser):
         expected = state.arrays.get(_NEXT)
         if len(self._points) != count or (expected is not None and not np.array_equal(self._next, expected)):
             raise ValueError("SciPy requests other points than recorded; its version may have changed")
+        self._goes_on = expected is None and not self.finished
 
 
 def _of_scipy(

@@ -26,7 +26,7 @@ from pathreplay.inverse.parameters.pyramid import Pyramid
 from pathreplay.inverse.parameters.regularizers import Laplacian, Own, Penalty, Prior, Term, TotalVariation
 from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
 from pathreplay.inverse.parameters.response import RESPONSE
-from pathreplay.inverse.parameters.values import Array, make_heights, make_value, require_finite_array, seen
+from pathreplay.inverse.parameters.values import Array, Arrays, make_heights, make_value, require_finite_array, seen
 from pathreplay.platform import compat
 from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes import parameters
@@ -74,6 +74,16 @@ class Variable:
 def latents(variables: Iterable[Variable], values: Mapping[str, Array]) -> dict[str, Array]:
     """Convert ``values`` to the latent arrays that the optimiser steps, by key."""
     return {v.key: v.coordinates.latent(values[v.key]) if v.coordinates else values[v.key] for v in variables}
+
+
+def decoded(variables: Iterable[Variable], latent: Arrays, values: Arrays) -> dict[str, Array]:
+    """Return the values of ``latent`` arrays within their bounds, by key, and ``values`` of variables without one."""
+    found = dict(values)
+    for v in variables:
+        if v.key in latent:
+            value = v.coordinates.values(latent[v.key]) if v.coordinates else latent[v.key]
+            found[v.key] = np.clip(value, *v.bounds)
+    return found
 
 
 def latent_bounds(variable: Variable) -> tuple[float, float]:
