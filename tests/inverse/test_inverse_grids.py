@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
+import pathreplay
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.loop.loop import new_run
 from pathreplay.inverse.parameters import grids
+from pathreplay.inverse.problem.problem import errors_of
 from pathreplay.jobs import make_config, optimize
+from pathreplay.report.recovered import recovered_of
 from room_job import JOB, TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
 
 GRID = np.random.default_rng(3).random((3, 4, 5, 2), np.float32)
@@ -36,6 +41,23 @@ def test_environment_maps_are_resampled_across_the_seam() -> None:
     np.testing.assert_allclose(found[0, :, 0], [2.25, 0.25, 0.75, 1.25, 1.75, 3.75, 7.25, 6.75], rtol=1e-6)
     turned = grids.resampled(np.roll(sky, 1, axis=1), (2, 8, 1), wraps=True)
     np.testing.assert_allclose(turned, np.roll(found, 2, axis=1), rtol=1e-6)
+
+
+def test_errors_of_a_coarse_environment_map_are_taken_across_the_seam() -> None:
+    sky = np.random.default_rng(4).random((2, 4, 3), np.float32)
+    fine = grids.resampled(sky, (4, 8, 3), wraps=True)
+    light = {"type": "envmap", "bitmap": mi.Bitmap(fine)}
+    small = {"type": "hdrfilm", "width": 4, "height": 4}
+    scene = mi.load_dict({"type": "scene", "sky": light, "sensor": {"type": "perspective", "film": small}})
+    view = pathreplay.View(target=np.ones((4, 4, 3), np.float32))
+    problem = pathreplay.Problem(scene, {"sky.data": pathreplay.Parameter(resolutions=[4])}, view, eval_spp=1).built
+    (variable,) = problem.variables
+    problem = replace(problem, variables=(replace(variable, truth=fine),))
+    assert errors_of(problem, {"sky.data": sky}) == {"sky.data": pytest.approx(0, abs=1e-6)}
+    run = new_run(problem, problem.integrator)
+    run.values = {"sky.data": sky}
+    (item,) = recovered_of(problem, run)
+    assert item.error() == pytest.approx(0, abs=1e-6) and item.relative_error() == pytest.approx(0, abs=1e-6)
 
 
 def test_levels_keep_proportions_and_begin_in_their_iteration() -> None:

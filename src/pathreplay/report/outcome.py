@@ -110,6 +110,8 @@ class Recovered:
     """Vertex indices of the faces, (m, 3), if the parameter consists of the vertices of a mesh."""
     derived: bool = False
     """Whether the parameter is computed from other, recovered parameters."""
+    wraps: bool = False
+    """Whether the first and the last column of a texture are neighbours."""
 
     def known(self, *kinds: str) -> dict[str, Array]:
         """Return the values of the given kinds ('start', 'result', 'baseline', 'truth') that exist, by kind."""
@@ -136,7 +138,7 @@ class Recovered:
         given = self.known("start", "result", "baseline", "truth")
         finest = max(given.values(), key=lambda volume: volume.size)
         white = float((self.result if self.truth is None else self.truth).max()) or 1.0
-        return {kind: slices(matched(volume, finest)) / white for kind, volume in given.items()}
+        return {kind: slices(matched(volume, finest, self.wraps)) / white for kind, volume in given.items()}
 
     def numbers(self) -> dict[str, list[float]]:
         """Return initial value, result and truth as numbers by kind.
@@ -153,13 +155,14 @@ class Recovered:
         The error is None if there is no value of this kind, or if the truth is unknown.
         """
         value = getattr(self, kind)
-        return None if self.truth is None or value is None else rmse(value, self.truth)
+        return None if self.truth is None or value is None else rmse(value, self.truth, self.wraps)
 
     def relative_error(self) -> float | None:
         """Return |result - truth| / |truth| in L2 norms; None if the truth is unknown or zero."""
         if self.truth is None or not self.truth.any():
             return None
-        return float(np.linalg.norm(matched(self.result, self.truth) - self.truth) / np.linalg.norm(self.truth))
+        result = matched(self.result, self.truth, self.wraps)
+        return float(np.linalg.norm(result - self.truth) / np.linalg.norm(self.truth))
 
     def as_dict(self) -> Json:
         """Return the entry in parameters.json: all numbers if there are at most 16, otherwise shape, mean and range."""

@@ -26,16 +26,18 @@ from pathreplay.scenes.parameters import get_array
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
     """Return the parameters that are not poses. Parameters that are computed from other parameters come last."""
     parts = {name for pose in problem.poses for name in pose.of}
-    truths = [(v.key, v.truth) for v in problem.variables if v.key not in parts and v.key not in (EXPOSURE, RESPONSE)]
-    derived = {parameter.key: parameter.truth for parameter in problem.derived}
-    truths += derived.items()
+    derived = {parameter.key for parameter in problem.derived}
+    entries = [v for v in problem.variables if v.key not in parts and v.key not in (EXPOSURE, RESPONSE)]
+    known = [(entry.key, entry.truth, entry.form.wraps) for entry in (*entries, *problem.derived)]
     starts = with_scene(problem, {v.key: v.start for v in problem.variables})
     values = with_scene(problem, run.values)
     baselines = with_scene(problem, run.baseline.values) if run.baseline else {}
-    names = file_names([*(v.key for v in problem.variables), *derived])
+    names = file_names([*(v.key for v in problem.variables), *(parameter.key for parameter in problem.derived)])
     return tuple(
-        Recovered(key, names[key], starts[key], values[key], truth, baselines.get(key), derived=key in derived)
-        for key, truth in truths
+        Recovered(
+            key, names[key], starts[key], values[key], truth, baselines.get(key), derived=key in derived, wraps=wraps
+        )
+        for key, truth, wraps in known
     )
 
 

@@ -92,14 +92,17 @@ def comparable(shape: Sequence[int], other: Sequence[int]) -> bool:
     return same_kind or tuple(shape) == tuple(other)
 
 
-def matched(grid: Array, other: Array) -> Array:
-    """Resample ``grid`` to the shape of ``other``. The two shapes must be `comparable`."""
-    return grid if grid.shape == other.shape else resampled(grid, other.shape)
+def matched(grid: Array, other: Array, wraps: bool = False) -> Array:
+    """Resample ``grid`` to the shape of ``other`` (see `resampled`). The two shapes must be `comparable`."""
+    return grid if grid.shape == other.shape else resampled(grid, other.shape, wraps)
 
 
-def rmse(value: Array, truth: Array) -> float:
-    """Compute the root mean square error of values. A grid is resampled to the resolution of the true values."""
-    a, b = matched(value, truth).reshape(-1), truth.reshape(-1)
+def rmse(value: Array, truth: Array, wraps: bool = False) -> float:
+    """Compute the root mean square error of values.
+
+    A grid is resampled to the resolution of the true values (see `resampled`).
+    """
+    a, b = matched(value, truth, wraps).reshape(-1), truth.reshape(-1)
     # Work in pieces, because temporary arrays in double precision need four times the memory of the values.
     squares = [
         float(np.square(a[i : i + _PIECE].astype(np.float64) - b[i : i + _PIECE]).sum())

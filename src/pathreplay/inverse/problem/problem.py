@@ -233,13 +233,13 @@ def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
     Raises:
         PathreplayError: a derived parameter is not finite.
     """
-    errors = {v.key: rmse(values[v.key], v.truth) for v in problem.variables if v.truth is not None}
+    errors = {v.key: rmse(values[v.key], v.truth, v.form.wraps) for v in problem.variables if v.truth is not None}
     poses = [pose for pose in problem.poses if pose.truth is not None]
     variables = problem.cache.variables(problem, values) if problem.derived or poses else {}
     for entry in problem.derived:
         value = entry.require_finite(variables)
         if entry.truth is not None:
-            errors[entry.key] = rmse(parameters.get_array(value), entry.truth)
+            errors[entry.key] = rmse(parameters.get_array(value), entry.truth, entry.form.wraps)
     for pose in poses:
         if error := pose.error(parameters.get_array(pose.value(variables))):
             errors |= error.of(pose.key)
