@@ -6,14 +6,20 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.inverse.loop.loop import image_error, new_run, render_views
+from pathreplay.inverse.loop.verdict import verdict_of
 from pathreplay.inverse.parameters.grids import rmse
 from pathreplay.inverse.problem.problem import build_problem
 from pathreplay.jobs import make_config, optimize
+from pathreplay.library.iterations import run_of
+from pathreplay.report.result import outcome_of
+from pathreplay.runs.run_folder import Job
 from room_job import JOB, TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
 
 # What the job itself has: its kernels are compiled when the baseline's turn comes.
@@ -49,6 +55,24 @@ def test_rival_gets_the_same_time_and_both_are_shown() -> None:
     assert "Comparison with prb (baseline) at equal time" in html  # the job has prb as well
     assert len(re.findall(r"<figcaption>recovered by prb \(baseline\)</figcaption>", html)) == 2  # of both views
     assert (result.folder / "comparison.svg").exists() and (result.folder / "images/baseline-left.png").exists()
+
+
+def test_errors_of_poses_are_those_of_the_results() -> None:
+    """The results are means of iterates, so their errors are not those of the last iterates."""
+    key, plugin = "left.to_world", {"type": "pathreplay", "max_depth": 3, "boundary": "none"}
+    entry = {"key": key, "pose": "translation"}
+    config = make_config({**JOB, "integrator": plugin, "baseline": plugin, "parameters": [entry]})
+    problem = build_problem(config, Path.cwd())
+    run = run_of(problem)
+    assert run.baseline is not None
+    for each, shift in ((run, 0.25), (run.baseline, 0.5)):
+        each.values = {f"{key}:translation": np.float32([0, shift, 0])}
+        each.history = [Entry(0, 1.0, 1.0, {}, errors={f"{key}:position": 9.0, f"{key}:degrees": 9.0})]
+    images = {view.name: view.target for view in problem.views}
+    job = Job(config, None, Path.cwd())
+    outcome = outcome_of(job, Path("run"), problem, run, images, images, images, verdict_of(problem, run, False))
+    errors = [[side.errors[f"{key}:{part}"] for part in ("position", "degrees")] for side in outcome.comparison()]
+    assert errors[0] == pytest.approx([0.25, 0], abs=1e-4) and errors[1] == pytest.approx([0.5, 0], abs=1e-4)
 
 
 def test_without_a_rival_nothing_is_judged() -> None:

@@ -18,7 +18,7 @@ from pathreplay.inverse.images.metrics import Likeness
 from pathreplay.inverse.loop.checkpoint import Run
 from pathreplay.inverse.loop.verdict import Verdict
 from pathreplay.inverse.parameters.grids import matched, rmse, shown, slices
-from pathreplay.inverse.parameters.pose import Pose, PoseError, error_names
+from pathreplay.inverse.parameters.pose import Pose, PoseError
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.runs.run_folder import resume_command
 from pathreplay.types import Json
@@ -193,6 +193,8 @@ class RecoveredPose:
     value: Array
     """Resulting transform (4 x 4), or resulting vertices."""
     value_at_start: Array
+    baseline: Array | None = None
+    """Value that corresponds to ``value`` in the result of the baseline, if there is one."""
 
     def errors(self) -> dict[str, PoseError]:
         """Return the error of the result ('error') and of the initial value ('error_at_start'), by these names.
@@ -304,8 +306,10 @@ class Outcome:
         known = [item for item in self.recovered if item.truth is not None]
         contestants = []
         for name, run, kind in runs:
-            last = run.history[-1].errors if run.history else {}
             errors = {item.key: item.error(kind) or 0.0 for item in known}
-            poses = {name: last[name] for pose in self.poses for name in error_names(pose.pose.key) if name in last}
-            contestants.append(Contestant(name, run, errors | poses))
+            for item in self.poses:
+                value = item.value if kind == "result" else item.baseline
+                if value is not None and (error := item.pose.error(value)):
+                    errors |= error.of(item.pose.key)
+            contestants.append(Contestant(name, run, errors))
         return contestants

@@ -55,8 +55,16 @@ def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
         return ()
     starts = with_scene(problem, {v.key: v.start for v in problem.variables})
     values = with_scene(problem, run.values)
+    baselines = with_scene(problem, run.baseline.values) if run.baseline else {}
     return tuple(
-        RecoveredPose(pose, _parts(pose, starts), _parts(pose, values), values[pose.key], starts[pose.key])
+        RecoveredPose(
+            pose,
+            _parts(pose, starts),
+            _parts(pose, values),
+            values[pose.key],
+            starts[pose.key],
+            baselines.get(pose.key),
+        )
         for pose in problem.poses
     )
 
