@@ -12,10 +12,12 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.inverse.loop.checkpoint import Run
+from pathreplay.inverse.parameters.derived import Derived
 from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.parameters.pose import Pose
 from pathreplay.inverse.parameters.response import RESPONSE
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.variables import Variable
 from pathreplay.inverse.problem.problem import Problem, variables_of
 from pathreplay.platform import compat
 from pathreplay.platform.files import file_names
@@ -26,18 +28,26 @@ from pathreplay.scenes.parameters import get_array
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
     """Return the parameters that are not poses. Parameters that are computed from other parameters come last."""
     parts = {name for pose in problem.poses for name in pose.of}
-    derived = {parameter.key for parameter in problem.derived}
-    entries = [v for v in problem.variables if v.key not in parts and v.key not in (EXPOSURE, RESPONSE)]
-    known = [(entry.key, entry.truth, entry.form.wraps) for entry in (*entries, *problem.derived)]
+    entries: list[Variable | Derived] = [
+        v for v in problem.variables if v.key not in parts and v.key not in (EXPOSURE, RESPONSE)
+    ]
+    entries += problem.derived
     starts = with_scene(problem, {v.key: v.start for v in problem.variables})
     values = with_scene(problem, run.values)
     baselines = with_scene(problem, run.baseline.values) if run.baseline else {}
     names = file_names([*(v.key for v in problem.variables), *(parameter.key for parameter in problem.derived)])
     return tuple(
         Recovered(
-            key, names[key], starts[key], values[key], truth, baselines.get(key), derived=key in derived, wraps=wraps
+            each.key,
+            names[each.key],
+            starts[each.key],
+            values[each.key],
+            each.truth,
+            baselines.get(each.key),
+            derived=isinstance(each, Derived),
+            wraps=each.form.wraps,
         )
-        for key, truth, wraps in known
+        for each in entries
     )
 
 
