@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+import safetensors.numpy
 
 import pathreplay
 from pathreplay.errors import PathreplayError
@@ -173,6 +174,23 @@ def test_stopped_within_and_between_stages_is_undisturbed_to_the_bit(case: str) 
         assert {k: v.tobytes() for k, v in cut.parameters.items()} == {
             k: v.tobytes() for k, v in whole.parameters.items()
         }
+
+
+def test_a_frozen_parameter_has_the_averaged_value_that_the_result_has() -> None:
+    """Also where the run is stopped around the boundary of the stages."""
+    stages = [{"iterations": 12, "parameters": [FLOOR]}, {"iterations": 3, "parameters": [TEXTURE]}]
+    job = {**STAGED, "learning_rate": 0.3, "spp": 1, "stages": stages}
+    whole = optimize(make_config({**job, "output": "whole"}), progress=False)
+    for stop in (12, 13):
+        for state in iterate(make_config({**job, "output": f"cut{stop}"})):
+            if state.number == stop - 1:
+                break
+        last = safetensors.numpy.load_file(f"cut{stop}/checkpoint.safetensors")[f"value:{FLOOR}"]
+        # Iteration 12 is the last step of the floor, whose iterate is not the average.
+        assert (last.tobytes() == whole.parameters[FLOOR].tobytes()) == (stop > 12)
+        assert state.values[FLOOR].tobytes() == whole.parameters[FLOOR].tobytes()
+        optimize(resume=f"cut{stop}", progress=False)
+        assert saved(f"cut{stop}") == saved("whole")
 
 
 @pytest.mark.slow

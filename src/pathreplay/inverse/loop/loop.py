@@ -212,7 +212,8 @@ def require_gradients(problem: Problem, run: Run) -> None:
 def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
     """Take one step and append it to the history of the run.
 
-    First, refine the grids whose next resolution is due, which resets their optimiser state. Then evaluate the views of
+    First, give the variables that the stage freezes their averaged values, and refine the grids whose next resolution
+    is due, which resets their optimiser state. Then evaluate the views of
     the `batch` and sum the results in a fixed order. Each view, or each part of its samples (see `Config.parts`), has
     its own seed. Finally, step with the learning rate of the iteration (see `schedules`) and project all variables onto
     their bounds.
@@ -233,6 +234,7 @@ def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
     """
     begin, i = time.perf_counter(), len(run.history)
     part = part_at(problem, position)
+    _freeze(part, run)
     values, events = _refined(part, run.values, position)
     config = part.problem.config
     spp = config.spp if isinstance(config.spp, int) else noise.next_spp(config.adaptive_spp, run.history)
@@ -280,6 +282,14 @@ def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
     run.history.append(entry)
     run.whole = True
     return events
+
+
+def _freeze(part: Part, run: Run) -> None:
+    """Give frozen variables their averaged values, which the result then has as well."""
+    if isinstance(run.optimiser, Averaged):
+        frozen = set(run.optimiser.averaged) - part.moving
+        variables = [v for v in part.problem.variables if v.key in frozen]
+        run.values = decoded(variables, run.optimiser.freeze(latents(variables, run.values)), run.values)
 
 
 def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array], list[Event]]:

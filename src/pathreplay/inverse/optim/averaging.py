@@ -19,7 +19,7 @@ iterates fluctuate, and equals the last iterate if they move steadily.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -104,6 +104,15 @@ class Averaged(Optimiser):
             else:
                 self._means[key] = _Means(np.array(value, order="C"), np.array(value, order="C"))
         return self._optimiser.step(values, gradients, rates, loss)
+
+    @property
+    def averaged(self) -> Collection[str]:
+        """Return the keys of the variables that have means."""
+        return self._means.keys()
+
+    def freeze(self, values: Arrays) -> dict[str, Array]:
+        """Return the combinations of variables that have means, and begin new means with their next step."""
+        return {key: self._means.pop(key).combined(value) for key, value in values.items()}
 
     def answer(self, values: Arrays) -> dict[str, Array]:
         return {
