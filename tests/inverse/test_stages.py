@@ -177,20 +177,20 @@ def test_stopped_within_and_between_stages_is_undisturbed_to_the_bit(case: str) 
 
 
 def test_a_frozen_parameter_has_the_averaged_value_that_the_result_has() -> None:
-    """Also where the run is stopped around the boundary of the stages."""
-    stages = [{"iterations": 12, "parameters": [FLOOR]}, {"iterations": 3, "parameters": [TEXTURE]}]
+    """Also where the run is stopped between the stages."""
+    stages = [{"iterations": 12, "parameters": [FLOOR]}, {"iterations": 2, "parameters": [TEXTURE]}]
     job = {**STAGED, "learning_rate": 0.3, "spp": 1, "stages": stages}
-    whole = optimize(make_config({**job, "output": "whole"}), progress=False)
-    for stop in (12, 13):
-        for state in iterate(make_config({**job, "output": f"cut{stop}"})):
-            if state.number == stop - 1:
-                break
-        last = safetensors.numpy.load_file(f"cut{stop}/checkpoint.safetensors")[f"value:{FLOOR}"]
-        # Iteration 12 is the last step of the floor, whose iterate is not the average.
-        assert (last.tobytes() == whole.parameters[FLOOR].tobytes()) == (stop > 12)
-        assert state.values[FLOOR].tobytes() == whole.parameters[FLOOR].tobytes()
-        optimize(resume=f"cut{stop}", progress=False)
-        assert saved(f"cut{stop}") == saved("whole")
+    result = optimize(make_config({**job, "output": "whole"}), progress=False).parameters[FLOOR].tobytes()
+    for state in iterate(make_config({**job, "output": "cut"})):
+        if state.number == 11:
+            break
+    iterates = [
+        safetensors.numpy.load_file(f"{name}/checkpoint.safetensors")[f"value:{FLOOR}"].tobytes()
+        for name in ("cut", "whole")
+    ]
+    assert state.values[FLOOR].tobytes() == result and iterates[0] != result and iterates[1] == result
+    optimize(resume="cut", progress=False)
+    assert saved("cut") == saved("whole")
 
 
 @pytest.mark.slow
