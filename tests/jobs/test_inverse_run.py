@@ -172,6 +172,31 @@ def test_full_disk_leaves_nothing_half_written(write: int, resumable: bool, monk
         assert optimize(resume="runs/a-2", progress=False).iterations == 6
 
 
+def test_a_resume_writes_the_results_that_a_full_disk_has_kept_from_an_extended_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The report of the earlier end is not that of the run."""
+    with monkeypatch.context() as patch:
+        interrupt_at(3, patch)
+        run(output="run")
+    real, history = folders._write_through, Path("run/history.jsonl")
+
+    def write_through(path: Path, content: Content, held: int | None) -> None:
+        if path.name.startswith("views.json"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        real(path, content, held)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(folders, "_write_through", write_through)
+        with pytest.raises(PathreplayError, match="No space left on the disk"):
+            optimize(resume="run", progress=False)
+    assert len(history.read_text().splitlines()) == 3 and Path("run/report.html").exists()
+    assert optimize(resume="run", progress=False).iterations == 6
+    assert len(history.read_text().splitlines()) == 6
+    with pytest.raises(PathreplayError, match="has all its 6 iterations"):
+        optimize(resume="run", progress=False)
+
+
 def test_target_files_give_the_same_problem_as_the_scene_that_made_them() -> None:
     first = run(iterations=1)
     files = [str(first.folder / f"images/target-{name}.exr") for name in ("left", "right")]

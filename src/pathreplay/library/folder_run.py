@@ -16,7 +16,7 @@ from pathreplay.inverse.problem.feasibility import require_finite_loss
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.interrupts import Stop
 from pathreplay.report.live_page import Previews
-from pathreplay.report.result import RunResult, outcome_of, result_files, result_of
+from pathreplay.report.result import RunResult, has_results, outcome_of, result_files, result_of
 from pathreplay.runs.run_folder import Job, RunFolder, create_run_folder
 from pathreplay.runs.saving import Saving, first_files, go_on, saved_targets
 
@@ -129,9 +129,9 @@ def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
     config = problem.config
     held = {v.key for v in problem.variables} if config.stages else set()  # a stage may have frozen any variable
     before = go_on(folder.path, problem, run, held)
-    # A run that has taken all its iterations can still lack a report, for example because the disk was full. It is
-    # resumed only to write its results.
-    if not (folder.path / "report.html").exists():
+    # A run that has taken all its iterations can still lack its results, for example because the disk was full. It is
+    # resumed only to write them.
+    if not has_results(folder.path, len(run.history)):
         return before
     name = f"Run {folder.name}"
     if run.optimiser.finished:

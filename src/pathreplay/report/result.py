@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -25,6 +26,8 @@ from pathreplay.report.recovered import poses_of, recovered_of, with_faces, with
 from pathreplay.report.report import Film, report_files
 from pathreplay.runs.run_folder import Job, resume_command
 from pathreplay.scenes.volume_files import vol_bytes
+
+HISTORY = "history.jsonl"
 
 
 @dataclass(frozen=True, repr=False)
@@ -126,7 +129,6 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Conte
     files: dict[str, Content] = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
     views = {view.name: view.as_dict() for view in outcome.views}
     files["views.json"] = (json.dumps(views, indent=2) + "\n").encode()
-    files |= _run_files("", outcome.run.history, outcome.values)
     if baseline := outcome.run.baseline:
         files |= _run_files("baseline/", baseline.history, baseline.values)
     for view in outcome.views:
@@ -140,7 +142,18 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Conte
             files[f"images/volume-{kind}-{item.file_name}.png"] = png_bytes(image)
         if item.result.ndim == 4:
             files[f"volumes/{item.file_name}.vol"] = made(vol_bytes, item.result)
-    return {**files, **report_files(outcome, films)}
+    # The history is the last file to be renamed, because `has_results` reads it.
+    return {**files, **report_files(outcome, films), **_run_files("", outcome.run.history, outcome.values)}
+
+
+def has_results(folder: Path, iterations: int) -> bool:
+    """Return whether a run folder has the results of a run with so many iterations, and not of an earlier end."""
+    history = folder / HISTORY
+    if not history.is_file() or not (folder / "report.html").is_file():
+        return False
+    with contextlib.suppress(OSError), open(history, "rb") as file:
+        return sum(1 for _ in file) == iterations
+    return False
 
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
@@ -172,5 +185,5 @@ def _png(view: ViewPictures, kind: str) -> bytes:
 def _run_files(folder: str, history: Sequence[Entry], values: Mapping[str, Array]) -> dict[str, Content]:
     return {
         f"{folder}parameters.safetensors": partial(safetensors_chunks, values, {}),
-        f"{folder}history.jsonl": "".join(json.dumps(asdict(entry)) + "\n" for entry in history).encode(),
+        f"{folder}{HISTORY}": "".join(json.dumps(asdict(entry)) + "\n" for entry in history).encode(),
     }
