@@ -174,6 +174,16 @@ def test_what_cannot_go_on_is_told_in_one_line(photos: list[np.ndarray]) -> None
     assert run(problem, output="run", resume=True, steps=5).history[-1].iteration == 4
 
 
+def test_an_impossible_output_is_noticed_before_images_are_rendered(
+    photos: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pathreplay.library.folder_run.render_views", lambda *_: pytest.fail("images are rendered"))
+    Path("file").write_text("")
+    for resume in (False, True):
+        with pytest.raises(PathreplayError, match=r"cannot be created .*; give another 'output'$"):
+            run(problem_of(photos), output="file/run", resume=resume)
+
+
 def test_a_folder_of_a_run_that_cannot_begin_goes_again(photos: list[np.ndarray]) -> None:
     class Broken(Heavy):
         def step(self, *_: Any) -> Any:

@@ -242,6 +242,17 @@ def test_impossible_output_gets_one_line(name: str, where: str, room: Path) -> N
     assert set(room.rglob("*")) == before
 
 
+def test_an_impossible_output_is_noticed_before_targets_are_rendered(
+    room: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pathreplay.jobs.session.build_problem", lambda *_: pytest.fail("targets are rendered"))
+    before = set(room.rglob("*"))
+    for output in ("room.xml/run", "room.xml/a/run"):
+        line = one_line(lambda output=output: optimize("job.json", output=output, progress=False))  # type: ignore[misc]
+        assert line == f"Run folder {output} cannot be created (Not a directory); give another --output"
+    assert set(room.rglob("*")) == before
+
+
 @pytest.mark.parametrize("name", ["", "nowhere", "room.xml", "a\udcff", "n" * 300, "a\0b"])
 def test_impossible_resume_gets_one_line(name: str, room: Path) -> None:
     assert one_line(lambda: optimize(resume=name, progress=False))

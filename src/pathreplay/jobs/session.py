@@ -19,7 +19,7 @@ from pathreplay.platform.device import require_order
 from pathreplay.platform.interrupts import Stop, stopping, undisturbed
 from pathreplay.report.notebook import NotebookPanel, progress_of
 from pathreplay.report.result import RunResult
-from pathreplay.runs.run_folder import Job, RunFolder
+from pathreplay.runs.run_folder import Job, RunFolder, require_creatable
 from pathreplay.runs.saving import saved_targets
 
 
@@ -82,7 +82,9 @@ def _iterations(
     """Run a job: yield its iterations and return the result. A relative ``output`` refers to ``home``."""
     config = job.config
     with ExitStack() as stack:
-        if resumed is not None:
+        if resumed is None:
+            require_creatable(output, home, job.source)
+        else:
             stack.callback(resumed.lock.close)
         stack.enter_context(memory.within(config.budget))
         require_executor(config)

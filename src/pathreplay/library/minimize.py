@@ -30,7 +30,7 @@ from pathreplay.report.live_pictures import LivePictures
 from pathreplay.report.notebook import NotebookPanel, progress_of
 from pathreplay.report.progress import Progress
 from pathreplay.report.recovered import with_scene
-from pathreplay.runs.run_folder import Job, new_output, open_run_folder
+from pathreplay.runs.run_folder import Job, new_output, open_run_folder, require_creatable
 
 
 @dataclass(frozen=True, repr=False)
@@ -176,6 +176,8 @@ def _minimized(
             _, resumed = open_run_folder(output, in_python)
             stack.callback(resumed.lock.close)
             built = with_saved_targets(resumed.path, built)
+        elif output is not None:
+            require_creatable(new_output(output, None), Path.cwd(), None)
         run = run_of(built, stack.enter_context(crew_of(built.config, problem.base, built, bar.remark, bar.status)))
         if own is not None:
             run.optimiser = adapted(own, built, run.values)

@@ -13,6 +13,7 @@ import secrets
 import shlex
 import shutil
 import stat
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -360,6 +361,27 @@ def _remove_empty(folders: Iterable[Path]) -> None:
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()
+
+
+def require_creatable(output: Path, home: Path, source: Path | None) -> None:
+    """Check that a run folder can be created, before a run spends time on images.
+
+    The check creates and removes an empty folder in the innermost parent that exists.
+
+    Args:
+        output: path of the run folder.
+        home: folder to which a relative ``output`` refers.
+        source: the file of the config; None if the config comes from Python.
+
+    Raises:
+        PathreplayError: the run folder cannot be created.
+    """
+    try:
+        parent = next(folder for folder in (home / output).parents if folder.exists())
+        with undisturbed():
+            os.rmdir(tempfile.mkdtemp(PART, ".", parent))
+    except OSError as error:
+        raise PathreplayError(_not_made(output, error, source)) from error
 
 
 def _make_part(output: Path, home: Path, source: Path | None) -> Path:
