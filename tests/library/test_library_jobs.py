@@ -106,6 +106,21 @@ def test_python_and_the_command_line_go_on_with_each_others_runs(place: Path) ->
         pathreplay.minimize(load_job(path), output="whole", resume=True, progress=False)
 
 
+def test_a_resume_records_the_settings_that_it_changes(place: Path) -> None:
+    path = place / "job.yaml"
+    path.write_text(json.dumps({**JOB, "iterations": 3}))
+    with iterate(path, output="run") as begun:
+        next(begun)
+    config, page = Path("run/config.yaml"), Path("run/report.html")
+    pathreplay.minimize(load_job(path), output="run", resume=True, progress=False)
+    assert config.read_text() == path.read_text() and f"pathreplay optimize {path}" in page.read_text()
+    pathreplay.minimize(load_job(path), steps=4, output="run", resume=True, progress=False)
+    assert not config.exists() and json.loads(Path("run/config.json").read_text())["iterations"] == 4
+    assert str(Path("run/config.json").absolute()) in page.read_text()
+    with pytest.raises(PathreplayError, match="all its 4 iterations"):
+        optimize(resume="run", progress=False)
+
+
 def test_what_a_file_says_can_be_changed(place: Path) -> None:
     path = written(place)
     problem = load_job(path, spp=2, define=["seed=5"], target=None, views=View(0, np.full((4, 6, 3), 0.2)))

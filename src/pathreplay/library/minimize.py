@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -12,6 +12,7 @@ import numpy as np
 
 from pathreplay.distributed.ray_executor import crew_of, require_executor
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.events import Event
@@ -30,7 +31,8 @@ from pathreplay.report.live_pictures import LivePictures
 from pathreplay.report.notebook import NotebookPanel, progress_of
 from pathreplay.report.progress import Progress
 from pathreplay.report.recovered import with_scene
-from pathreplay.runs.run_folder import Job, new_output, open_run_folder, require_creatable
+from pathreplay.runs.run_folder import Job, new_output, open_run_folder, record_job, require_creatable
+from pathreplay.types import Json
 
 
 @dataclass(frozen=True, repr=False)
@@ -104,7 +106,8 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         progress: show a bar on a terminal, the loss curve and images in a notebook, or lines elsewhere.
         output: run folder for checkpoints, the page of ``pathreplay watch`` and the report. If the folder exists, a
             number is appended. Default: no files are written.
-        resume: resume the run in ``output`` from its last checkpoint, if the folder exists.
+        resume: resume the run in ``output`` from its last checkpoint, if the folder exists. The folder then records
+            the settings of this call.
         stages: tables of settings for parts of the run, like ``[[stages]]`` in a job; their ``iterations`` replace
             ``steps``.
         learning_rate_schedule: ``"constant"`` (the default), ``"exponential"``, ``"linear"`` or ``"cosine"``.
@@ -169,11 +172,11 @@ def _minimized(
         stack.enter_context(bar)
         for note in problem.notes + built.notes:
             bar.remark(note)
-        in_python, resumed = problem.in_memory or own is not None, None
+        in_python, opened, resumed = problem.in_memory or own is not None, None, None
         if resume and output is None:
             raise PathreplayError("resume = True needs a folder; give 'output'")
         if resume and output is not None and output.exists():
-            _, resumed = open_run_folder(output, in_python)
+            opened, resumed = open_run_folder(output, in_python)
             stack.callback(resumed.lock.close)
             built = with_saved_targets(resumed.path, built)
         elif output is not None:
@@ -185,8 +188,13 @@ def _minimized(
         if output is not None:
             run.optimiser.state()  # raises PathreplayError if the state of the user's optimizer cannot be saved
             job = Job(built.config, None, problem.base, in_python=in_python)
+            changed = opened is not None and _settings(opened.config) != _settings(built.config)
+            if opened is not None and not changed:
+                job = replace(opened, config=built.config)
             kept = FolderRun(job, built, run, stop, new_output(output, None), Path.cwd(), resumed)
             stack.callback(kept.folder.lock.close)
+            if changed:
+                record_job(kept.folder, job)
         say, remedy = bar.say if progress else _warn, "aborted" if kept is None else kept.remedy
         stack.enter_context(stopping(say, remedy, stop))
         observers = [bar.observe, *_observers(bar, built, run, stop, kept)]
@@ -205,6 +213,11 @@ def _minimized(
     folder = None if kept is None else kept.folder.path
     stopped = run.optimiser.finished or (stop.by if len(run.history) < built.config.iterations else None)
     return Result(found, run.history, stopped, problem, folder)
+
+
+def _settings(config: Config) -> Json:
+    """Return the settings of a run that a resume records, which are all except where it is computed."""
+    return config.model_dump(mode="json", exclude={"variant", "executor"})
 
 
 def _is_true(value: object) -> bool:

@@ -31,7 +31,8 @@ from pathreplay.runs.folder_lock import FolderLock
 from pathreplay.types import Json
 
 PART = ".part"
-_CONFIGS = "config.toml", "config.yaml", "config.json"
+# In the order in which they are looked for: if `record_job` ends early, config.json is newer than the others.
+_CONFIGS = "config.json", "config.toml", "config.yaml"
 _FOLDERS = "images", "volumes", "baseline", "previews"
 CHECKPOINT = "checkpoint.safetensors"
 BASELINE_CHECKPOINT = "baseline/checkpoint.safetensors"
@@ -207,6 +208,24 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
     Raises:
         PathreplayError: the folder cannot be created or written.
     """
+    home = Path.cwd() if home is None else home
+    missing = [folder for folder in (home / output).parents if not folder.exists()]
+    with undisturbed(), contextlib.ExitStack() as undo:
+        undo.callback(_remove_empty, missing)
+        part = _make_part(output, home, job.source)
+        undo.callback(shutil.rmtree, part, ignore_errors=True)
+        run = RunFolder(part, in_python=job.in_python)
+        run.given, run.home, run.created_parents = _free(output, home), home, missing
+        undo.callback(run.lock.close)
+        run.write({**_job_files(job), **files})
+        run.given = _claim(part, output, home, job.source)
+        run.path = home / run.given
+        undo.pop_all()
+    return run
+
+
+def _job_files(job: Job) -> dict[str, Content]:
+    """Return the config of a job and run.json, by name."""
     if job.source is not None and job.content is not None and job.source.suffix.lower() != ".json" and not job.changes:
         name = "config.yaml" if job.source.suffix.lower() in YAML else "config.toml"
         copy: dict[str, Content] = {name: job.content}
@@ -223,20 +242,16 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
         origin["changes"] = list(job.changes)
     if job.in_python:
         origin["in_python"] = True
-    home = Path.cwd() if home is None else home
-    missing = [folder for folder in (home / output).parents if not folder.exists()]
-    with undisturbed(), contextlib.ExitStack() as undo:
-        undo.callback(_remove_empty, missing)
-        part = _make_part(output, home, job.source)
-        undo.callback(shutil.rmtree, part, ignore_errors=True)
-        run = RunFolder(part, in_python=job.in_python)
-        run.given, run.home, run.created_parents = _free(output, home), home, missing
-        undo.callback(run.lock.close)
-        run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
-        run.given = _claim(part, output, home, job.source)
-        run.path = home / run.given
-        undo.pop_all()
-    return run
+    return {**copy, "run.json": json.dumps(origin, indent=2).encode()}
+
+
+def record_job(folder: RunFolder, job: Job) -> None:
+    """Replace the job of a run folder by one from Python, whose config is ``config.json``.
+
+    Raises the same errors as `RunFolder.write`.
+    """
+    folder.write(_job_files(job))
+    folder.discard(name for name in _CONFIGS if name != "config.json")
 
 
 class _Origin(BaseModel):
