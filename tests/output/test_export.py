@@ -143,6 +143,35 @@ def test_the_index_of_glass_comes_out_as_that_of_mitsubas_plugin(tmp_path: Path)
     assert b'type="dielectric"' in found.files["scene.xml"] and b"1.309" in found.files["scene.xml"]
 
 
+TURNED = mi.ScalarTransform4f().translate([0, 0.2, 0.5]).rotate([1, 0, 0], 50)
+#: Parts of a scene, and the value of a parameter.
+PARTS: dict[str, tuple[dict[str, Any], str, Any]] = {
+    **{
+        plugin: ({"ball": {"type": "sphere", "bsdf": {"type": plugin, "int_ior": "bk7"}}}, "ball.bsdf.eta", [1.31])
+        for plugin in ("dielectric_ad", "thindielectric", "roughdielectric", "roughplastic")
+    },
+    "metal": (
+        {"ball": {"type": "sphere", "bsdf": {"type": "roughconductor", "material": "Au"}}},
+        "ball.bsdf.eta.value",
+        [0.3, 0.9, 1.4],
+    ),
+    "disk": (
+        {"ball": {"type": "disk", "flip_normals": True, "emitter": {"type": "area"}}},
+        "ball.to_world",
+        np.array(TURNED.matrix) @ np.diag([1, 1, -1, 1]),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", PARTS)
+def test_values_come_out_with_their_parts(case: str, tmp_path: Path) -> None:
+    parts, key, value = PARTS[case]
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    eye = {"type": "perspective", "to_world": mi.ScalarTransform4f().translate([0, 0, -4]), "film": film}
+    scene = {"type": "scene", "eye": eye, "sky": {"type": "constant"}, "integrator": {"type": "path"}, **parts}
+    same_pictures(exported(Source(scene, {}, {}, {}), {key: np.float32(value)}), tmp_path / "out")
+
+
 MANY = """<scene version="3.0.0"><default name="res" value="8"/>
 <integrator type="prb"><integer name="max_depth" value="4"/></integrator>
 <sensor type="perspective" id="eye"><float name="fov" value="40"/>

@@ -15,6 +15,7 @@ from typing import TypeAlias
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.registration import PLUGINS
 from pathreplay.platform.threads import spare_thread
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import require_values
@@ -95,6 +96,9 @@ def describe(
             _join(state, name, mi.parser.parse_dict(config, dict(camera)))
         for node in state.nodes:
             exchange(node.props, plugins, floats)
+            name = node.props.plugin_name()
+            if node.type == mi.ObjectType.Unknown and name in PLUGINS:  # Mitsuba parses dictionaries so
+                node.type = _types()[PLUGINS[name][0]]
         require_sound_files(state)
         mi.parser.transform_all(config, state)
         if medium is not None:
@@ -102,6 +106,10 @@ def describe(
         described = Described(state, folder)
         owners = [_deepest(described, owner) for owner in _owners(config, state, described.nodes)]
     return described, owners
+
+
+def _types() -> dict[str, mi.ObjectType]:
+    return {"bsdf": mi.ObjectType.BSDF, "integrator": mi.ObjectType.Integrator, "medium": mi.ObjectType.Medium}
 
 
 def _join(state: mi.parser.ParserState, name: str, camera: mi.parser.ParserState) -> None:

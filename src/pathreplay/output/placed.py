@@ -24,6 +24,7 @@ _ALSO_PLACES = {
     "sphere": ("center", "radius"),
     "cylinder": ("p0", "p1", "radius"),
     "directional": ("direction",),
+    "disk": ("flip_normals",),
 }
 """Properties by plugin whose effect `mi.traverse` includes in `to_world`. An exported `to_world` replaces them."""
 
@@ -33,6 +34,10 @@ _KNOWN: dict[str, tuple[str, tuple[str, ...]]] = {
     "SmoothConductor": ("conductor", ("eta", "k", "specular_reflectance")),
     "AreaLight": ("area", ("radiance",)),
 }
+_BY_IOR = frozenset({"dielectric_ad", "roughdielectric", "roughplastic", "thindielectric"})
+"""Plugins whose parameter ``eta`` is given by the properties ``int_ior`` and ``ext_ior``."""
+_METALS = {"eta": "k", "k": "eta"}
+"""Properties of conductors that replace ``material``. Both must be given."""
 _PLAIN_SPECTRA = ("SRGBReflectanceSpectrum", "UniformSpectrum")
 
 
@@ -163,7 +168,7 @@ class Placing:
             _remove(node.props, "focal_length")
             node.props["fov_axis"] = "x"
             node.props["fov"] = float(value[0])
-        elif plugin == "dielectric_ad" and place == "eta":
+        elif plugin in _BY_IOR and place == "eta":
             node.props["int_ior"], node.props["ext_ior"] = float(value[0]), 1.0
         elif place.endswith(".value") or place == "value":
             name = place.split(".")[0]
@@ -173,6 +178,10 @@ class Placing:
                     "recover it in an rgb variant"
                 )
             _set_colour(node.props, name, value)
+            if name in _METALS and "material" in node.props:
+                _remove(node.props, "material")
+                other = _METALS[name]
+                _set_colour(node.props, other, get_array(self.params[f"{key.removesuffix(place)}{other}.value"]))
         elif value.size == 1 and "." not in place:
             node.props[place] = float(value.ravel()[0])
         elif value.size == 3 and "." not in place:
