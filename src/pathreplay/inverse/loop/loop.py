@@ -213,10 +213,9 @@ def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
     """Take one step and append it to the history of the run.
 
     First, give the variables that the stage freezes their averaged values, and refine the grids whose next resolution
-    is due, which resets their optimiser state. Then evaluate the views of
-    the `batch` and sum the results in a fixed order. Each view, or each part of its samples (see `Config.parts`), has
-    its own seed. Finally, step with the learning rate of the iteration (see `schedules`) and project all variables onto
-    their bounds.
+    is due, which resets their optimiser state. Then evaluate the views of the `batch` and sum the results in a fixed
+    order. Each view, or each part of its samples (see `Config.parts`), has its own seed. Finally, step with the
+    learning rate of the iteration (see `schedules`) and project all variables onto their bounds.
 
     The integrator determines which derivatives the gradient contains. Targets, bounds and random numbers are not
     differentiated.
