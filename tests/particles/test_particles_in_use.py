@@ -306,6 +306,14 @@ def test_a_frozen_step_may_be_the_first_use(plugin: dict, monkeypatch: pytest.Mo
     assert frozen == [pytest.approx(plain, rel=1e-4) for plain in results(step)]
 
 
+def test_light_paths_are_not_told_of_lamps_that_camera_paths_miss(log: list[str]) -> None:
+    made = balls(light="point")
+    away = mi.ScalarTransform4f().look_at([0, 3, 0], [0, 0, 0], [0, 0, 1])
+    made["lamp"] = {"type": "rectangle", "to_world": away, "emitter": {"type": "directionalarea"}}
+    gradient(loaded(made), PARTICLES, "floor.bsdf.reflectance.value", 4)
+    assert not any("directionalarea" in line for line in log)
+
+
 @pytest.mark.parametrize("key", ["bulb.intensity.value", "floor.bsdf.reflectance.value"])
 def test_lamps_that_camera_paths_do_not_find_leave_gradients_right(key: str, log: list[str]) -> None:
     """A `directionalarea` has no light for them, so that gradients are those without it."""

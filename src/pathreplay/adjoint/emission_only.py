@@ -29,9 +29,10 @@ def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     With symbolic calls, one traced step covers the virtual functions of all objects of the scene. Without symbolic
     calls, the step would cover only the objects at the first vertices.
     """
-    if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
+    traits = trace.traits
+    if trace.media is not None or traits.directed_areas or not traits.lights_vary:
         return False
-    if trace.traits.directed_areas:
+    if not dr.flag(dr.JitFlag.SymbolicCalls):
         return False
     if not trace.scene.shapes():  # without shapes, no virtual function of a BSDF is traced
         return False

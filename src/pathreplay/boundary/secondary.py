@@ -2,8 +2,9 @@
 
 At a scattering vertex x, light arrives from a direction ω. When parameters change, the interior term moves ω with a
 velocity V. An emitter sample keeps its random numbers u. Any other sample follows its hit point with weight φ (see
-`velocity`). In narrow lobes, a sample keeps its direction instead (see `keeps_direction`). At an edge, the integrand
-jumps from f_near to f_far. The boundary term of the scattered radiance J contains the motion of the edge relative to V:
+`velocity`). In narrow lobes and at collisions in media, a sample keeps its direction instead (see `keeps_direction`).
+At an edge, the integrand jumps from f_near to f_far. The boundary term of the scattered radiance J contains the motion
+of the edge relative to V:
 
     dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import mitsuba as mi
-import numpy as np
 
 from pathreplay.boundary.observer import omitted_distance
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.edge_notes import edges_note, keys_that_move_edges
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.platform import compat
-from pathreplay.transport.facts.traits import SUNSKY
+from pathreplay.transport.facts.traits import SUNSKY, is_specular
 from pathreplay.transport.vertex import TraceConfig
 
 COST_OF_EDGES = (
@@ -73,11 +72,6 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
             "a blendbsdf contains a lobe of delta reflection or transmission (a mirror, glass, plastic), whose samples "
             "Mitsuba weighs wrongly: image and gradient are biased; use a rough lobe instead"
         )
-    if traits.directed_areas and trace.to_sensor is None:
-        yield (
-            "camera paths do not find the light of a directionalarea emitter, which image and gradient lack: "
-            "use 'pathreplay_particles'"
-        )
     if traits.masks_mirrors:
         yield (
             "a mask covers delta lobes, which Mitsuba then cannot sample one by one: derivatives with respect to "
@@ -85,8 +79,8 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
         )
     if trace.media is not None and trace.media.passes and traits.opacity_moves:
         yield (
-            "the opacity of a mask has gradients in a scene with media: its effect on emitter samples whose "
-            "shadow rays cross the mask is missing from the gradient"
+            "the opacity of a mask, or the weight of a blend that transmits light, has gradients in a scene with "
+            "media: its effect on emitter samples whose shadow rays cross the surface is missing from the gradient"
         )
     if traits.tables_move:
         yield (
@@ -122,12 +116,21 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
 def sun_note(trace: TraceConfig) -> str:
     """Format the message about the disc of a sun that is seen in mirrors or glass; "" if there is none."""
     skies = [light for light in trace.scene.emitters() if light.class_name() == SUNSKY]
-    if not trace.traits.mirrors or not any(np.any(np.array(mi.traverse(sky)["sun_scale"]) > 0) for sky in skies):
+    if not any(map(is_specular, trace.traits.mirrors)) or not any(mi.traverse(sky)["sun_scale"] > 0 for sky in skies):
         return ""
     return (
         "something moves in a scene with delta lobes and a sunsky: the motion of the edge of the sun's disc, which is "
         "seen through glass or mirrors, is missing from the gradient; use a directional emitter and sun_scale = 0"
     )
+
+
+def camera_doubts(trace: TraceConfig) -> Iterator[str]:
+    """Yield messages about light that camera paths do not find."""
+    if trace.traits.directed_areas:
+        yield (
+            "camera paths do not find the light of a directionalarea emitter, which image and gradient lack: use "
+            "'pathreplay_particles'"
+        )
 
 
 def particle_doubts(trace: TraceConfig) -> Iterator[str]:

@@ -22,6 +22,7 @@ from pathreplay.integrators.boundary_term import Boundary
 from pathreplay.integrators.camera_pass import Pass, Seed, Which
 from pathreplay.integrators.diagnostics import (
     COST_OF_EDGES,
+    camera_doubts,
     doubts,
     lost_note,
     missing_edges,
@@ -219,8 +220,9 @@ class PathReplayIntegrator(PathIntegrator):
             tables = facts_of(view.scene).recorded_tables(state.tables, edges=True)
             trace = replace(trace, traits=replace(trace.traits, tables=tables))
         if self.boundary != "primary":
-            fog = trace.media is not None
-            trace = replace(trace, may_slide=not fog, holds_collisions=fog and not facts_of(view.scene).has_seams)
+            fog, facts = trace.media is not None, facts_of(view.scene)
+            holds = fog and not (facts.has_seams or facts.has_textured_curves)
+            trace = replace(trace, may_slide=not fog, holds_collisions=holds)
         return view, trace, (*terms, *motion)
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
@@ -371,8 +373,8 @@ class PathReplayIntegrator(PathIntegrator):
 
         A pass never uses a control variate to which it has contributed, because the gradient would be biased.
         """
-        hidden = () if self.particles is None else particle_doubts(trace)
-        for doubt in filter(None, (*doubts(trace), *hidden, *(term.note(trace) for term in self.terms))):
+        other = camera_doubts(trace) if self.particles is None else particle_doubts(trace)
+        for doubt in filter(None, (*doubts(trace), *other, *(term.note(trace) for term in self.terms))):
             self._warn_once(doubt)
         if trace.media is None or state.guess is None:
             return None

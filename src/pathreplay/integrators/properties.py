@@ -29,7 +29,12 @@ RR_DEPTH = Property(
     5,
     "Depth from which Russian roulette may end a path. Its probabilities are not differentiated.",
 )
-HIDE_EMITTERS = Property("hide_emitters", "boolean", False, "The camera does not see emitters directly.")
+HIDE_EMITTERS = Property(
+    "hide_emitters",
+    "boolean",
+    False,
+    "The camera does not see emitters directly, nor environments behind surfaces that transmit light unscattered.",
+)
 ADJOINT = Property(
     "adjoint",
     "string",

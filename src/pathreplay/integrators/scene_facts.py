@@ -15,6 +15,7 @@ from pathreplay.transport.facts.dark_texels import DarkTexels
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of, plain_numbers, with_gradients
 from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
+    BLEND,
     INSTANCE,
     MASK,
     PLASTIC,
@@ -24,6 +25,7 @@ from pathreplay.transport.facts.traits import (
     blend_lengths,
     emitter_bounds,
     fixed_traits,
+    is_veil,
     scene_bounds,
     smoothing_groups_of,
     tables_of,
@@ -56,11 +58,12 @@ class SceneFacts:
         self._emitters = [*scene.emitters(), *(shape for shape in self._shapes if shape.is_emitter())]
         self._mesh_emitters = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
-        self._masks = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == MASK]
+        self._masks = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() in (MASK, BLEND)]
         self._plastics = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == PLASTIC]
         self._splines = [s for s in self._shapes if s.shape_type() == mi.ShapeType.BSplineCurve]
         self._textures = [node for node in nodes if isinstance(node, mi.Texture)]
         self._seams: bool | None = None
+        self._textured_curves = any(map(_is_painted, (shape for shape in self._shapes if not shape.is_mesh())))
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
         self._bounded = any(shape.is_medium_transition() for shape in self._shapes)
         self._bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
@@ -86,6 +89,11 @@ class SceneFacts:
         if self._seams is None and not is_recording():
             self._seams = has_seams(self._textures)
         return self._seams is not False
+
+    @property
+    def has_textured_curves(self) -> bool:
+        """Whether a sphere or another shape without triangles has a texture, which may jump where it wraps."""
+        return self._textured_curves
 
     def absent_lobes(self) -> tuple[str, ...]:
         """Return the parameters that lack the derivative of a lobe (see `AbsentLobes`). Empty in a recording."""
@@ -126,7 +134,7 @@ class SceneFacts:
             tables=self.tables() if tables is None else tables,
             lights_deform=any(with_gradients(mesh, *compat.POSITIONS) for mesh in self._mesh_emitters),
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
-            opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
+            opacity_moves=any(with_gradients(mask, "opacity", "weight") for mask in self._masks if is_veil(mask)),
             tables_move=any(with_gradients(plastic, "alpha", "eta") for plastic in self._plastics),
             splines_move=any(with_gradients(curve, "control_points") for curve in self._splines),
             skies_move=any(with_gradients(light) for light in self._lights if light.class_name() == SUNSKY),
@@ -178,6 +186,10 @@ class SceneFacts:
         for shape in self._placed:
             box.expand(shape.bbox())
         return box
+
+
+def _is_painted(shape: mi.Shape) -> bool:
+    return any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes_of(shape))
 
 
 def _kinds_with_constants() -> tuple[type, ...]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
-import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -30,7 +29,7 @@ SceneValue: TypeAlias = "dr.ArrayBase | mi.Transform4f"
 """A differentiable value of `mi.SceneParameters`."""
 
 # Name that Mitsuba gives to an object without id; the number is a memory address.
-UNNAMED = re.compile(r"object_\d+")
+UNNAMED = re.compile(r"object_\d{9,}")
 
 # Remedies for values that Mitsuba 3.9 stores without derivatives, by (class of the owner, last part of the key).
 _WAY_OUT = {
@@ -77,17 +76,22 @@ def resolve_keys(params: Mapping[str, object], patterns: str | Iterable[str], ow
     return list(selected)
 
 
-def require_ids(params: mi.SceneParameters, patterns: Iterable[str]) -> None:
-    """Raise PathreplayError if a glob in ``patterns`` matches a parameter of an object without id.
+def notes_on_ids(params: mi.SceneParameters, patterns: Iterable[str]) -> tuple[str, ...]:
+    """Return notes on globs in ``patterns`` that match parameters of objects without id.
 
-    Mitsuba calls such an object by its address in memory. No other process could resume or export a run by this name.
+    Mitsuba calls such an object by its address in memory. No other process can resume or export a run by this name.
     """
-    for key, pattern in itertools.product(params.keys(), patterns):
-        if UNNAMED.match(key) and fnmatch.fnmatchcase(key, pattern):
-            raise PathreplayError(
-                f"'{pattern}' matches '{UNNAMED.sub('', key)[1:]}' of an object without id, by which a run cannot be "
-                'resumed or exported; give it an id in the scene file, for example id="light"'
-            )
+    found = (
+        (pattern, UNNAMED.sub("", key)[1:])
+        for pattern in patterns
+        for key in params.keys()
+        if UNNAMED.match(key) and fnmatch.fnmatchcase(key, pattern)
+    )
+    return tuple(
+        f"'{pattern}' matches '{place}' of an object without id, whose name is an address in memory; give it an id "
+        "in the scene file to resume or export this run"
+        for pattern, place in dict(found).items()
+    )
 
 
 def keep_only(params: mi.SceneParameters, keys: Iterable[str]) -> None:

@@ -75,19 +75,19 @@ def redraw_emitter(
 
     ``light`` is the original sample, or None if it is not available. If ``attached``, the sampled point has fixed
     coordinates on the emitter and moves with the emitter; direction, distance and density are differentiated as well.
-    Otherwise the point is fixed in space, and only the emitted radiance is differentiated. Visibility is never
-    differentiated.
+    Otherwise the point is fixed in space, and only the emitted radiance is differentiated; in scenes with a
+    `directionalarea`, the motion of emitters is then differentiated as well. Visibility is never differentiated.
     """
     scene = trace.scene
     if attached or trace.traits.directed_areas:  # Mitsuba does not implement `eval_direction` of such emitters
         painted = mi.Bool(False)
-        if trace.traits.painted_meshes:
+        if trace.traits.painted_meshes and not trace.traits.directed_areas:
             still, _ = draw_emitter(scene, dr.detach(origin), u, lit, visible=False)
             painted = lit & is_painted(still.emitter) & still.emitter.get_shape().is_mesh()
         light, Le = scene.sample_emitter_direction(origin, u, False, lit & ~painted)
         if trace.traits.lights_deform:
             Le *= _mesh_growth(trace, origin, light, lit & ~painted)
-        if trace.traits.painted_meshes:
+        if trace.traits.painted_meshes and not trace.traits.directed_areas:
             at_fixed_point, glow = _at_fixed_point(trace, origin, still, painted)
             light, Le = dr.select(painted, at_fixed_point, light), dr.select(painted, glow, Le)
         return light, Le

@@ -240,15 +240,17 @@ def _delta_weight(
     (``thindielectric``, ``plastic``) the derivative of the Fresnel term is lost in this cancellation. The lobe is
     therefore sampled again alone, through ``BSDFContext.component``, and its weight is divided by the detached
     selection probability. If weight or direction then differ from the original sample, the plugin does not support
-    restricted sampling, and the derivative of the original weight is used. BSDFs made of `EXACT` ones return weights
-    with the right derivative, and are not sampled again unless other BSDFs require it.
+    restricted sampling, and the derivative of the original weight is used. Mitsuba cannot sample the unscattered
+    transmission of a mask inside of a blend alone. In blends, transmission is therefore evaluated instead. BSDFs made
+    of `EXACT` ones return weights with the right derivative, and are not sampled again unless other BSDFs require it.
     """
     drawn = dr.detach(w)
     missing = mi.Bool(active)
     if trace.traits.blended_veils:
-        # Mitsuba evaluates the unscattered transmission of a blend, but cannot sample that of a mask inside of it.
         T = v.bsdf.eval_null_transmission(v.si, active)
-        straight = active & (dr.squared_norm(v.si.wi + v.si.to_local(kept.d)) < SAME_LOBE) & dr.all(dr.detach(T) > 0)
+        wi, wo = v.si.wi, v.si.to_local(kept.d)
+        straight = active & (mi.Frame3f.cos_theta(wi) * mi.Frame3f.cos_theta(wo) < 0)
+        straight &= (dr.squared_norm(wi + wo) < SAME_LOBE) & dr.all(dr.detach(T) > 0)
         w = dr.select(straight, drawn * T * dr.detach(reciprocal(T)), w)
         missing &= ~straight
     for k in range(trace.traits.lobes):

@@ -120,7 +120,9 @@ class Arrival:
     hit: mi.PreliminaryIntersection3f
     pdf: mi.Float  # solid-angle density of ray.d at the previous vertex
     delta: mi.Bool  # the direction comes from a delta lobe or from the camera
-    camera: mi.Bool  # the previous vertex is the camera or, on light paths, the emitter
+    # The previous vertex is the camera or, on light paths, the emitter. In scenes with media and with `hide_emitters`,
+    # surfaces that the path passes unscattered do not count.
+    camera: mi.Bool
     # None in scenes without media:
     medium: mi.MediumPtr = None  # type: ignore[assignment]  # the medium that contains the ray
     behind: mi.Float = None  # type: ignore[assignment]  # distance from the ray's origin back to the previous vertex, through null boundaries

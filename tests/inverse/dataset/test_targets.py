@@ -249,17 +249,22 @@ def test_a_target_has_the_shadow_of_a_shape_that_has_left_the_scene(folder: Path
 def test_films_that_store_xyz_are_refused(film: str, way_out: str, folder: Path) -> None:
     """Targets are RGB images."""
     (folder / "room.xml").write_text(scene(film))
-    mi.Bitmap(colours()).write("target.exr")
+    (folder / "target.exr").write_bytes(exr_bytes(colours()))
     with pytest.raises(PathreplayError, match=f"'eye' has pixel_format = '{film}', .*; use '{way_out}'$"):
         target_of("target.exr")
 
 
-def test_parameters_of_objects_without_id_are_refused(folder: Path) -> None:
+def test_parameters_of_objects_without_id_are_told(folder: Path) -> None:
     """Their names are addresses in memory, which no other process knows."""
     (folder / "room.xml").write_text(scene().replace(' id="sky"', ""))
-    mi.Bitmap(colours()).write("target.exr")
-    with pytest.raises(PathreplayError, match="of an object without id, by which a run"):
-        problem_of({"images": ["target.exr"]}, parameters=[{"key": "*.radiance.value"}])
+    (folder / "target.exr").write_bytes(exr_bytes(colours()))
+    keys = [{"key": "*.radiance.value"}]
+    (folder / "named.xml").write_text(scene().replace('"sky"', '"object_1"'))
+    problem = problem_of({"images": ["target.exr"]}, scene="named.xml", parameters=keys)
+    assert [variable.key for variable in problem.variables] == ["object_1.radiance.value"]
+    assert not problem.notes
+    (note,) = problem_of({"images": ["target.exr"]}, parameters=keys).notes
+    assert note.startswith("'*.radiance.value' matches 'radiance.value' of an object without id, ")
 
 
 def test_alpha_does_not_set_the_exposure() -> None:

@@ -112,7 +112,8 @@ class Averaged(Optimiser):
 
     def freeze(self, values: Arrays) -> dict[str, Array]:
         """Return the combinations of variables that have means, and begin new means with their next step."""
-        return {key: self._means.pop(key).combined(value) for key, value in values.items()}
+        means = {key: self._means.pop(key) for key in values}
+        return {k: means[k].combined(value) for k, value in values.items() if means[k].short.shape == value.shape}
 
     def answer(self, values: Arrays) -> dict[str, Array]:
         return {

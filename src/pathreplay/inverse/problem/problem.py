@@ -20,6 +20,7 @@ from pathreplay.integrators.film.image import fit_film
 from pathreplay.integrators.integrator import EDGES
 from pathreplay.integrators.lifetimes import one_renderer
 from pathreplay.integrators.reach import reached_sensors
+from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import TARGET, Config
 from pathreplay.inverse.config.tables import Plugin
@@ -205,6 +206,7 @@ def put_values(problem: Problem, values: Arrays) -> None:
     """Set the parameters of the scene, or of all scenes, to the values of the variables, without gradients."""
     for each in problem.scenes():
         each.params.update(scene_values(each, each.cache.variables(each, values)))
+        facts_of(each.scene).enclose(each.scene)
 
 
 def detach(problem: Problem) -> None:
@@ -356,7 +358,7 @@ def _loaded(
     wanted += [entry.key for entry in config.derived]
     cameras = {name: shot.camera for name, shot in shots.items()}
     scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
-    parameters.require_ids(traversed(scene), wanted)
+    notes += parameters.notes_on_ids(traversed(scene), wanted)
     if config.capture is not None and config.capture.medium is not None:
         put_inside(scene, set(shots), config.capture.medium)
     config, differences = completed(config, scene, given.integrator)

@@ -15,7 +15,10 @@ TEXTURES = {"AreaLight": "radiance.data", "EnvironmentMapEmitter": "data", "Proj
 
 
 class DarkTexels:
-    """Emitters that had black texels when these were first seen with gradients."""
+    """Emitters that had black texels when these were first seen with gradients.
+
+    Spectral variants store coefficients in place of colours. There, black texels are not recognised.
+    """
 
     def __init__(self, emitters: Iterable[mi.Emitter]) -> None:
         self._unexamined = [emitter for emitter in emitters if emitter.class_name() in TEXTURES]
@@ -25,9 +28,10 @@ class DarkTexels:
         """Examine the emitters whose texels have gradients for the first time. Return all known ones, as text."""
         for emitter in list(self._unexamined):
             name = TEXTURES[emitter.class_name()]
-            for texels in with_gradients(emitter, name):
+            given = with_gradients(emitter, name)
+            if given:
                 self._unexamined.remove(emitter)
-                if np.any(np.all(np.array(dr.detach(texels)) == 0, axis=-1)):
-                    shape = emitter.get_shape()
-                    self._known.append(f"'{name}' of emitter '{(emitter if shape is None else shape).id()}'")
+            if any(np.any(np.all(np.array(dr.detach(texels)) == 0, axis=-1)) for texels in given):
+                shape = emitter.get_shape()
+                self._known.append(f"'{name}' of emitter '{(emitter if shape is None else shape).id()}'")
         return tuple(self._known)

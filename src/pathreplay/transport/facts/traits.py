@@ -142,10 +142,10 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         renumbered=any(bsdf.class_name() in (TWO_SIDED, BLEND) for bsdf in bsdfs),
         copies=any(shape.class_name() == INSTANCE for shape in shapes),
         splines=any(shape.shape_type() == mi.ShapeType.BSplineCurve for shape in shapes),
-        veils=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf) for bsdf in bsdfs),
+        veils=any(map(is_veil, bsdfs)),
         masks_mirrors=any(map(_delta_lobes, masked)),
-        blended_veils=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in blends),
-        blended_mirrors=any(map(_is_specular, blends)),
+        blended_veils=any(map(is_veil, blends)),
+        blended_mirrors=any(map(is_specular, blends)),
         narrow=narrow,
         glossy=narrow and not any(node.class_name() == CHECKERBOARD for node in nodes),
         outlines=not _seamless(shapes, nodes),
@@ -288,6 +288,11 @@ def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
     return bsdf.flags() & (others | mi.BSDFFlags.Null) == +mi.BSDFFlags.Null
 
 
+def is_veil(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF transmits a part of the light unscattered, and not all of it."""
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf)
+
+
 def _attachables(nodes: set[mi.Object], shapes: list[mi.Shape]) -> list[mi.BSDF]:
     # Mitsuba adds a diffuse BSDF to an emissive shape without BSDF. Such a BSDF is not sampled attached.
     of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
@@ -314,7 +319,7 @@ def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
     return kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk) or (kind == mi.ShapeType.Sphere and not textured)
 
 
-def _is_specular(bsdf: mi.BSDF) -> bool:
+def is_specular(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF has a lobe of delta reflection or transmission. Transmission without scattering is none."""
     return bool(bsdf.flags() & (mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission))
 
