@@ -58,7 +58,7 @@ def test_rival_gets_the_same_time_and_both_are_shown() -> None:
 
 
 def test_errors_of_poses_are_those_of_the_results() -> None:
-    """The results are means of iterates, so their errors are not those of the last iterates."""
+    """A result is a mean of iterates. Its errors differ from those of the last iterate."""
     key, plugin = "left.to_world", {"type": "pathreplay", "max_depth": 3, "boundary": "none"}
     entry = {"key": key, "pose": "translation"}
     config = make_config({**JOB, "integrator": plugin, "baseline": plugin, "parameters": [entry]})

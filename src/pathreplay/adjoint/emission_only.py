@@ -25,9 +25,9 @@ def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """Return whether only emitted radiance has gradients: no weight depends on a parameter, and nothing moves.
 
     The result is always False in scenes with media, or with a `directionalarea` emitter, which `relight` cannot
-    evaluate. It is also always False if symbolic calls are turned off in Dr.Jit.
-    With symbolic calls, one traced step covers the virtual functions of all objects of the scene. Without symbolic
-    calls, the step would cover only the objects at the first vertices.
+    evaluate. It is also always False if symbolic calls are turned off in Dr.Jit. With symbolic calls, one traced step
+    covers the virtual functions of all objects of the scene. Without symbolic calls, the step would cover only the
+    objects at the first vertices.
     """
     traits = trace.traits
     if trace.media is not None or traits.directed_areas or not traits.lights_vary:

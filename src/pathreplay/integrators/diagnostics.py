@@ -114,7 +114,7 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
 
 
 def sun_note(trace: TraceConfig) -> str:
-    """Format the message about the disc of a sun that is seen in mirrors or glass; "" if there is none."""
+    """Format the message about the sun of a `sunsky` in a scene with mirrors or glass; "" without such a sun."""
     skies = [light for light in trace.scene.emitters() if light.class_name() == SUNSKY]
     if not any(map(is_specular, trace.traits.mirrors)) or not any(mi.traverse(sky)["sun_scale"] > 0 for sky in skies):
         return ""

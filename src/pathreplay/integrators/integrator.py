@@ -221,7 +221,7 @@ class PathReplayIntegrator(PathIntegrator):
             trace = replace(trace, traits=replace(trace.traits, tables=tables))
         if self.boundary != "primary":
             fog, facts = trace.media is not None, facts_of(view.scene)
-            holds = fog and not (facts.has_seams or facts.has_textured_curves)
+            holds = fog and not (facts.has_seams or facts.has_wrapping_textures)
             trace = replace(trace, may_slide=not fog, holds_collisions=holds)
         return view, trace, (*terms, *motion)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import mitsuba as mi
 import numpy as np
@@ -63,7 +64,6 @@ class SceneFacts:
         self._splines = [s for s in self._shapes if s.shape_type() == mi.ShapeType.BSplineCurve]
         self._textures = [node for node in nodes if isinstance(node, mi.Texture)]
         self._seams: bool | None = None
-        self._textured_curves = any(map(_is_painted, (shape for shape in self._shapes if not shape.is_mesh())))
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
         self._bounded = any(shape.is_medium_transition() for shape in self._shapes)
         self._bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
@@ -90,10 +90,10 @@ class SceneFacts:
             self._seams = has_seams(self._textures)
         return self._seams is not False
 
-    @property
-    def has_textured_curves(self) -> bool:
+    @cached_property
+    def has_wrapping_textures(self) -> bool:
         """Whether a sphere or another shape without triangles has a texture, which may jump where it wraps."""
-        return self._textured_curves
+        return any(_is_painted(shape) for shape in self._shapes if not shape.is_mesh())
 
     def absent_lobes(self) -> tuple[str, ...]:
         """Return the parameters that lack the derivative of a lobe (see `AbsentLobes`). Empty in a recording."""

@@ -97,7 +97,7 @@ def describe(
         for node in state.nodes:
             exchange(node.props, plugins, floats)
             name = node.props.plugin_name()
-            if node.type == mi.ObjectType.Unknown and name in PLUGINS:  # Mitsuba parses dictionaries so
+            if node.type == mi.ObjectType.Unknown and name in PLUGINS:  # a Python plugin in a dictionary
                 node.type = _types()[PLUGINS[name][0]]
         require_sound_files(state)
         mi.parser.transform_all(config, state)
@@ -109,6 +109,7 @@ def describe(
 
 
 def _types() -> dict[str, mi.ObjectType]:
+    """Return the types of objects by their names in `PLUGINS`."""
     return {"bsdf": mi.ObjectType.BSDF, "integrator": mi.ObjectType.Integrator, "medium": mi.ObjectType.Medium}
 
 

@@ -147,7 +147,7 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Conte
 
 
 def has_results(folder: Path, iterations: int) -> bool:
-    """Return whether a run folder has the results of a run with so many iterations, and not of an earlier end."""
+    """Return whether a run folder contains results, and they were written after this number of iterations."""
     history = folder / HISTORY
     if not history.is_file() or not (folder / "report.html").is_file():
         return False

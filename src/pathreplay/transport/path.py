@@ -125,7 +125,7 @@ def next_arrival(
         hit = skip_null(trace, ray, hit, active)
     scattered = at.scattered
     if trace.without_caustics:
-        scattered = dr.select(first, ~kept.delta if trace.media is None else ~(kept.delta | null), at.scattered)
+        scattered = dr.select(first, ~(kept.delta | null), at.scattered)
     if trace.media is None:
         camera = null & at.camera if trace.hide_emitters and trace.to_sensor is None else mi.Bool(False)
         return Arrival(ray, hit, kept.pdf, kept.delta, camera, scattered=scattered)

@@ -57,7 +57,7 @@ def _part(problem: Problem, number: int, stage: Stage) -> Part:
     seen = _views(problem, stage)
     views = problem.views
     if seen is not None:
-        # The weights of the stage's views have the mean 1, like those of all training views.
+        # Scale the weights to mean 1 over the views of the stage.
         mean = float(np.mean([view.share for view in views if view.name in seen]))
         views = tuple(replace(v, is_test=v.name not in seen, share=v.share / mean) for v in views)
     moving = frozenset(_moving(problem, stage))
