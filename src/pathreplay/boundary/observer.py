@@ -25,7 +25,7 @@ from pathreplay.transport.start import CameraStart, behind_emitters
 from pathreplay.transport.surface import met
 from pathreplay.transport.velocity import moved_direction
 from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, is_smooth
-from pathreplay.transport.volume.media import carried, span
+from pathreplay.transport.volume.media import carried, extinction_of, span
 from pathreplay.transport.volume.passage import (
     further,
     is_boundary,
@@ -169,7 +169,8 @@ class ObserverVertex:
         if self.flight is None:
             return si
         a, b = span(self.at.medium, ray, dr.select(si.is_valid(), si.t, dr.inf), self.event)
-        t, _ = carried(self.flight.t, a, b, self.event)
+        κ = extinction_of(self.trace.media, self.at.medium, ray, self.event)
+        t, _ = carried(self.flight.t, a, b, self.event, κ)
         origin = mi.Interaction3f(self.origin)
         origin.p = dr.select(self.event, ray.o + t * ray.d, si.p)
         origin.n = dr.select(self.event, 0, si.n)

@@ -21,7 +21,16 @@ import mitsuba as mi
 
 from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.vertex import Arrival, Flight, NullCollision, TraceConfig, reciprocal
-from pathreplay.transport.volume.media import Grid, Media, carried, interaction, is_grid, majorant, span
+from pathreplay.transport.volume.media import (
+    Grid,
+    Media,
+    carried,
+    extinction_of,
+    interaction,
+    is_grid,
+    majorant,
+    span,
+)
 
 # Number of points of a flight at which its transmittance is differentiated. Fewer points increase the variance, more
 # points take more time. Four give the lowest variance at equal time for the cloud of `pathreplay bench media`.
@@ -189,8 +198,8 @@ def fly_again(
     """Evaluate a recorded flight again, differentiable in the coefficients and, if ``attached``, in ray and ``reach``.
 
     ``reach`` is the distance to the surface, or infinity if there is none. The medium covers an interval of the ray,
-    and a collision keeps its relative position in this interval. The collision thus moves with the ray and with the
-    surface, and never crosses an end of the interval. Such a crossing would add a boundary term.
+    and a collision moves with the ends of this interval (see `carried`). It never crosses an end of the interval. Such
+    a crossing would add a boundary term.
 
     Let a and t be the ends of the flight, y a random point between them, x the collision, and b any function of
     position and direction (`TraceConfig.baseline`). The control variate
@@ -206,9 +215,10 @@ def fly_again(
     event = in_medium & flight.event
     with dr.suspend_grad(when=not attached):
         a, b = span(medium, ray, reach, in_medium)
-        t, stretch = flight.t, mi.Float(1)
+        t, stretch, κ = flight.t, mi.Float(1), None
         if attached:
-            t, stretch = carried(t, a, b, event)
+            κ = extinction_of(trace.media, medium, ray, in_medium)
+            t, stretch = carried(t, a, b, event, κ)
         end = dr.select(event, t, b)
         mei = interaction(medium, ray, t)
         through = in_medium & dr.isfinite(end)
@@ -233,14 +243,14 @@ def fly_again(
         if trace.baseline is not None:
             σ_bar = majorant(medium, ray, in_medium)
             guesses = [σ * _guess(trace, y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
-            score = dr.select(through, length / POINTS * sum(guesses), 0)
+            # With κ, y moves unlike x. The motion then has little noise, and is left out of the control variate.
+            l, J = (length, stretch) if κ is None else dr.detach((length, stretch))
+            score = dr.select(through, l / POINTS * sum(guesses), 0)
             scored = event
             for grid in trace.media.grids:
                 if _scores_at_collisions(trace, grid):
                     scored &= ~is_grid(grid, medium)
-            score -= dr.select(
-                scored, σ_t * stretch * dr.rcp(flight.density) * _guess(trace, mei, σ_t, σ_bar, event), 0
-            )
+            score -= dr.select(scored, σ_t * J * dr.rcp(flight.density) * _guess(trace, mei, σ_t, σ_bar, event), 0)
             e += score - dr.detach(score)
 
     if trace.media.emissive:
