@@ -197,6 +197,10 @@ def _fog(extinction: float) -> SceneDict:
     return {"type": "cube", "to_world": T().scale(0.9), "bsdf": {"type": "null"}, "interior": medium}
 
 
+def _bulb() -> SceneDict:
+    return _ball([0.3, 0.3, 0.8], 0.12) | {"emitter": {"type": "area", "radiance": 8.0}}
+
+
 def _textured_ball() -> SceneDict:
     return _ball([0, 0, 0], 0.8, {"type": "diffuse", "reflectance": _texture(0.1, 0.9)})
 
@@ -222,6 +226,10 @@ MOVERS: dict[str, Mover] = {
     ),
     "ball in thick fog": Mover(
         _scene(object=lambda: _ball([0, 0, 0], 0.4), sky=lambda: SKY, fog=lambda: _fog(4.0)), _slide(1, 0.3, 0)
+    ),
+    "wall behind a lamp": Mover(_scene(object=_wall, bulb=_bulb), _slide(1, 0.3, 0)),
+    "ball behind a lamp": Mover(
+        _scene(wall=_wall, object=lambda: _ball([0, 0, 0], 0.5), bulb=_bulb), _slide(1, 0.3, 0)
     ),
     "small in a room": Mover(
         _scene(_above, floor=_floor, wall=_wall, object=lambda: _ball([0.3, -0.3, 0.5], 0.06), lamp=_lamp),

@@ -53,6 +53,8 @@ MOVING = {
     "ball lifts off": (PLACE, 3),
     "ball in fog": (PLACE, 5),
     "ball in thick fog": (PLACE, 5),
+    "wall behind a lamp": (PLACE, 3),
+    "ball behind a lamp": (PLACE, 3),
     "small in a room": (PLACE, 3),
 }
 """Scenes for derivatives with respect to one number: the key of the moving parameter, and the depth."""

@@ -15,8 +15,9 @@ from edge_ordinary import PAINT, Moving, T, film, grey, hold_quiet, loaded, meas
 from edge_truth import hold_agreement
 from pathreplay.integrators import integrator as integrators
 from pathreplay.integrators.camera_pass import Pass
-from pathreplay.integrators.film.camera_flow import Sample
+from pathreplay.integrators.film import surface_flow
 from pathreplay.integrators.film.grid import NODES
+from pathreplay.integrators.film.sample import Sample
 from pathreplay.integrators.film.surface_flow import SurfaceFlow
 from pathreplay.testing.objective import Objective
 from pathreplay.testing.statistics import gap
@@ -38,6 +39,10 @@ def texture(**more: Any) -> dict:
 def floor(bsdf: dict) -> dict:
     place = T().translate([0, -0.5, 0]).rotate([1, 0, 0], -90).scale(3)
     return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+
+
+def wall(bsdf: dict) -> dict:
+    return {"type": "rectangle", "to_world": T().translate([0, 0, -1]).scale(3), "bsdf": bsdf}
 
 
 def ball(bsdf: dict) -> dict:
@@ -105,6 +110,25 @@ CELLS: dict[str, Write] = {
     ),
 }
 QUICK = "painted ball before a sky"
+BULB = {
+    "type": "sphere",
+    "to_world": T().translate([0.3, 0.5, 0.6]).scale(0.15),
+    "emitter": {"type": "area", "radiance": 8.0},
+}
+LIT: dict[str, Write] = {
+    "painted wall behind a lamp": moving(
+        "wall.to_world", translate(1, 0.3, 0), wall=lambda: wall(painted(texture())), bulb=BULB
+    ),
+    "ball behind a lamp": moving("ball.to_world", translate(1, 0.3, 0), ball=ball(PAINT), bulb=BULB),
+    "room around a lamp": moving(
+        "room.to_world",
+        translate(1, 0.3, 0.2),
+        sensor(place=T().look_at([0, 0, 0.7], [0, 0, 0], [0, 1, 0])),
+        room={"type": "sphere", "to_world": T().scale(1), "flip_normals": True, "bsdf": PAINT},
+        bulb={**BULB, "to_world": T().translate([0.3, 0.1, -0.2]).scale(0.1)},
+    ),
+}
+"""A static light that is seen before something that moves."""
 
 
 @pytest.mark.parametrize("name", [n if n == QUICK else pytest.param(n, marks=pytest.mark.slow) for n in CELLS])
@@ -131,11 +155,35 @@ def test_noise_is_below_that_of_a_difference(tmp_path: Path) -> None:
     hold_quiet(CELLS[QUICK](tmp_path), tmp_path)
 
 
-def test_noise_inside_one_colour_falls_with_the_size_of_the_film() -> None:
+@pytest.mark.parametrize("name", LIT)
+def test_a_static_light_in_the_view_makes_no_noise(name: str, tmp_path: Path) -> None:
+    """If film positions move across the light, the variance is 50 to 10^7 times that of a difference."""
+    hold_quiet(LIT[name](tmp_path), tmp_path)
+
+
+@pytest.mark.parametrize("mover", ["camera", "ball"])
+def test_a_sun_in_the_view_does_not_move_with_what_is_near(mover: str) -> None:
+    """The derivative is zero. It is as large as the image if film positions move across the sun."""
+    sky = {"type": "sunsky", "sun_direction": [0, 1, 0.3], "sky_scale": 0.0, "sun_scale": 1e-3, "sun_aperture": 20.0}
+    camera = sensor(place=T().look_at([0, 0, 0], [0, 1, 0.3], [0, 0, 1]))
+    black = {"type": "sphere", "center": [0, 3, -0.6], "radius": 0.4, "bsdf": grey(0, 0, 0)}
+    scene = mi.load_dict({"type": "scene", "camera": camera, "sky": sky, "ball": black}, optimize=False)
+    objective = Objective(scene, mi.traverse(scene), f"{mover}.to_world", translate(1, 0, 0))
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    image = mi.render(scene, integrator=integrator, spp=16).numpy()
+    objective.weigh(np.broadcast_to(np.linspace(0, 1, image.shape[1])[:, None], image.shape))
+    found = np.mean([objective.backward(integrator, seed, 64) for seed in range(6)])
+    objective.put(dr.opaque(mi.Float, 0))
+    assert abs(found) < 0.2 * image.mean()
+
+
+def test_noise_inside_one_colour_falls_with_the_size_of_the_film(monkeypatch: pytest.MonkeyPatch) -> None:
     """A wall under a constant sky translates. Inside its outline the image stays, and the flow brings noise alone.
 
     With a mean over a fixed number of pixels that noise grows with the film, as the velocity in pixels does.
     """
+
+    monkeypatch.setattr(surface_flow, "_limbs", lambda *_: mi.Float(1))  # of itself, the film does not follow walls
 
     def noise_of(size: int) -> float:
         wall = {"type": "rectangle", "to_world": T().scale(0.8), "bsdf": PAINT}

@@ -10,7 +10,8 @@ from typing import TypeAlias
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.integrators.film.camera_flow import FilmFlow, Sample
+from pathreplay.integrators.film.camera_flow import FilmFlow
+from pathreplay.integrators.film.sample import Sample
 from pathreplay.integrators.lifetimes import is_recording
 from pathreplay.platform.registration import mitsuba_integrator
 from pathreplay.samplers.owen_sobol import OwenSobolSampler, key_of, morton_index

@@ -23,12 +23,22 @@ follow the visible surfaces.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.integrators.film.grid import NODES, PROBES, Cell, NodeSums, interpolated, probe_position
+from pathreplay.integrators.film.grid import NODES, Cell, NodeSums, interpolated
+from pathreplay.integrators.film.lights import SeenLights
+from pathreplay.integrators.film.sample import (
+    STEP,
+    RayDerivatives,
+    Sample,
+    film_velocity,
+    move_with_position,
+    probes_of,
+    ray_derivatives,
+)
 from pathreplay.transport.facts.nodes import with_gradients
 
 PINHOLE = "PerspectiveCamera"
@@ -37,32 +47,10 @@ CAMERAS = frozenset({PINHOLE, "ThinLensCamera", "OrthographicCamera"})
 ONLY_POSITIONS = "x_fov", "principal_point_offset_x", "principal_point_offset_y"
 """Camera parameters that only move rays to other film positions. The film flow contains all motion of such rays."""
 OTHERS = "to_world", "focus_distance", "aperture_radius"
-STEP = 1 / 256
-"""Step of central differences in film widths, and relative step for differences in the closeness. The derivatives have
-a relative error of 4e-6 for a field of view of 40°, and of 1e-4 for 120°."""
+FARTHEST = 1e-6
+"""Closeness near bright parts of the sky, relative to that of surfaces."""
 K_0 = 1e3
 """Weight of the mean closeness of all visible surfaces, at each node."""
-
-RayDerivatives: TypeAlias = "tuple[list[mi.Vector3f], list[mi.Vector3f]]"
-"""∂o/∂s and ∂d/∂s of a ray, along both axes of the film."""
-
-
-@dataclass(frozen=True)
-class Sample:
-    """The arguments of Mitsuba's `Sensor.sample_ray`. Positions are in units of the film's width and height."""
-
-    time: mi.Float | float
-    wavelength: mi.Float
-    position: mi.Point2f
-    aperture: mi.Point2f
-
-    def ray(self, sensor: mi.Sensor) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """Return the sensor's ray and its weight. The ray is attached to the sensor and to the film position."""
-        return sensor.sample_ray_differential(self.time, self.wavelength, self.position, self.aperture)
-
-    def at(self, position: mi.Point2f) -> Sample:
-        """Return a copy of the sample at another film position."""
-        return Sample(self.time, self.wavelength, position, self.aperture)
 
 
 class FilmFlow(Protocol):
@@ -179,38 +167,6 @@ class CameraFlow:
         return -film_velocity(δp, derivatives, r)
 
 
-def film_velocity(δp: mi.Vector3f, derivatives: RayDerivatives, t: mi.Float) -> mi.Vector2f:
-    """Return, by least squares, the film velocity of points that lie at distance t on the rays and move by δp."""
-    x, y = (o_k + t * d_k for o_k, d_k in zip(*derivatives, strict=True))
-    xx, xy, yy = dr.dot(x, x), dr.dot(x, y), dr.dot(y, y)
-    a, b = dr.dot(x, δp), dr.dot(y, δp)
-    return mi.Vector2f(yy * a - xy * b, xx * b - xy * a) / (xx * yy - xy * xy)
-
-
-def move_with_position(ray: mi.Ray3f, derivatives: RayDerivatives, v: mi.Vector2f) -> None:
-    """Add to ``ray`` the motion that a ray has if its film position moves with the velocity v."""
-    o, d = derivatives
-    ray.o += o[0] * v.x + o[1] * v.y
-    ray.d += d[0] * v.x + d[1] * v.y
-
-
-def probes_of(sensor: mi.Sensor) -> Sample:
-    """Return the samples of the probe rays: see `probe_position`."""
-    i = dr.arange(mi.UInt32, PROBES * PROBES)
-    return Sample(sensor.shutter_open(), mi.Float(0.5), probe_position(i), mi.Point2f(0.5))
-
-
-def ray_derivatives(sensor: mi.Sensor, sample: Sample) -> RayDerivatives:
-    """Return detached derivatives of a ray with respect to its film position, by central differences."""
-    o, d = [], []
-    with dr.suspend_grad():
-        for step in (mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP)):
-            a, b = (sample.at(sample.position + side * step).ray(sensor)[0] for side in (-1, 1))
-            o.append((b.o - a.o) / (2 * STEP))
-            d.append((b.d - a.d) / (2 * STEP))
-    return o, d
-
-
 def _is_carried(sensor: mi.Sensor) -> bool:
     """Return whether gradients of the camera's pose may leave motion of rays that the film flow does not contain.
 
@@ -229,8 +185,10 @@ def _closeness(scene: mi.Scene, sensor: mi.Sensor) -> mi.Float:
     """Return the mean of the reciprocal distances of the surfaces that are visible near each node (see `grid`).
 
     Parallax is proportional to reciprocal distances. Rays that miss all surfaces do not count: edges move with the
-    surfaces in front of a background, and a background has no edges of its own.
+    surfaces in front of a background, and a background has no edges of its own. Bright parts of the sky have no
+    parallax: see `lights`.
     """
+    seen = SeenLights.of(scene, sensor)
     with dr.suspend_grad():
         ray, _ = probes_of(sensor).ray(sensor)
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
@@ -240,5 +198,6 @@ def _closeness(scene: mi.Scene, sensor: mi.Sensor) -> mi.Float:
         dr.eval(closeness, visible, mean)
         sums = NodeSums.of(dr.select(visible, mi.Float(1), 0))
         nodes = (K_0 * mean + sums.of_values(closeness)) / (K_0 + sums.total())
+        nodes = dr.select(nodes > 0, nodes, 1) * dr.maximum(seen.share_kept(seen.sky), FARTHEST)
         dr.eval(nodes)
-        return dr.select(nodes > 0, nodes, 1)
+        return nodes

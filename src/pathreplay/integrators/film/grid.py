@@ -22,7 +22,7 @@ MARGIN = 2
 """Number of nodes outside each border of the film, where filters still have support."""
 NODES = CELLS + 1 + 2 * MARGIN
 """Number of nodes per row and column."""
-REACH, NEAR = 0.25, 0.03
+REACH, NEAR, WIDE = 0.25, 0.03, 0.5
 """In film widths."""
 
 Value = TypeVar("Value", "mi.Float", "mi.Vector2f")
@@ -41,12 +41,18 @@ class NodeSums:
     i: mi.UInt32  # probe ray of each pair
 
     @staticmethod
-    def of(weights: mi.Float) -> NodeSums:
-        """Compute the weights; ``weights`` are the w of the probe rays."""
+    def of(weights: mi.Float, wide: bool = False) -> NodeSums:
+        """Compute the weights; ``weights`` are the w of the probe rays.
+
+        If ``wide``, K = max(1 - (r / WIDE)², 0)².
+        """
         index = dr.arange(mi.UInt32, NODES * NODES * PROBES * PROBES)
         node, i = index // (PROBES * PROBES), index % (PROBES * PROBES)
         r2 = dr.squared_norm(mi.Point2f(_cell_of(node)) / CELLS - probe_position(i))
-        K = dr.square(dr.maximum(1 - r2 / REACH**2, 0) / (r2 + NEAR**2))
+        if wide:
+            K = dr.square(dr.maximum(1 - r2 / WIDE**2, 0))
+        else:
+            K = dr.square(dr.maximum(1 - r2 / REACH**2, 0) / (r2 + NEAR**2))
         return NodeSums(K * dr.gather(mi.Float, weights, i), i)
 
     def total(self) -> mi.Float:
@@ -57,6 +63,15 @@ class NodeSums:
 
     def _sum(self, values: mi.Float) -> mi.Float:
         return dr.block_sum(values, PROBES * PROBES)
+
+
+def distance_to(positions: mi.Point2f, valid: mi.Bool) -> mi.Float:
+    """Return the distance of each node from the nearest of the ``valid`` positions; infinite if there is none."""
+    n = dr.width(positions)
+    index = dr.arange(mi.UInt32, NODES * NODES * n)
+    node, i = index // n, index % n
+    away = dr.norm(mi.Point2f(_cell_of(node)) / CELLS - dr.gather(mi.Point2f, positions, i))
+    return dr.block_reduce(dr.ReduceOp.Min, dr.select(dr.gather(mi.Bool, valid, i), away, dr.inf), n)
 
 
 @dataclass(frozen=True)

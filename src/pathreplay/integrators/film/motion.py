@@ -39,9 +39,10 @@ from pathreplay.adjoint.autodiff import backward, tangents
 from pathreplay.adjoint.baseline import Baseline
 from pathreplay.adjoint.primal import primal
 from pathreplay.integrators.camera_pass import Pass
-from pathreplay.integrators.film.camera_flow import FilmFlow, Sample
+from pathreplay.integrators.film.camera_flow import FilmFlow
 from pathreplay.integrators.film.domain import FilmPlaces
 from pathreplay.integrators.film.filter_samples import FilterSamples
+from pathreplay.integrators.film.sample import Sample
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.samplers.owen_sobol import OwenSobolSampler
 from pathreplay.samplers.streams import Stream

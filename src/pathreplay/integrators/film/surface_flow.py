@@ -30,15 +30,10 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import tangents
-from pathreplay.integrators.film.camera_flow import (
-    CAMERAS,
-    Sample,
-    film_velocity,
-    move_with_position,
-    probes_of,
-    ray_derivatives,
-)
+from pathreplay.integrators.film.camera_flow import CAMERAS
 from pathreplay.integrators.film.grid import Cell, NodeSums, interpolated, is_near
+from pathreplay.integrators.film.lights import SeenLights
+from pathreplay.integrators.film.sample import Sample, film_velocity, move_with_position, probes_of, ray_derivatives
 from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.meet import meet
@@ -47,6 +42,9 @@ from pathreplay.transport.vertex import TraceConfig
 
 K_0 = 1e3
 """Weight that favours fixed film positions."""
+STEEP, ENOUGH = 0.5, 0.02
+"""STEEP is the cosine below which an angle is grazing. ENOUGH is the fraction of grazing angles near a node, and the
+variance of normals, from which on the flow is not reduced."""
 GRAZING, NARROW = 0.1, 0.004
 """GRAZING is the cosine below which W levels off. NARROW is S times the square of the film's width in radians."""
 
@@ -81,10 +79,11 @@ class SurfaceFlow:
             moves = visible & may_move(trace, hit)
             dr.eval(u, W, moves)  # evaluate once: every node gathers from these arrays
 
+            share = _limbs(moves, mi.Vector3f(dr.detach(si.n)), dr.abs(cos)) * _away_from_lights(trace, sensor)
             sums = NodeSums.of(W)
             total = K_0 + sums.total()
-            nodes = mi.Vector2f(*(sums.of_values(u[k]) / total for k in (0, 1)))
-        moved = sums.of_values(dr.select(moves, mi.Float(1), 0)) > 0
+            nodes = mi.Vector2f(*(share * sums.of_values(u[k]) / total for k in (0, 1)))
+        moved = (sums.of_values(dr.select(moves, mi.Float(1), 0)) > 0) & (share > 0)
         dr.eval(nodes, moved)
         flows = is_near(moved)
         dr.eval(flows)
@@ -115,6 +114,25 @@ class SurfaceFlow:
     def carry_tangents(self) -> None:
         with dr.resume_grad():
             tangents(self.nodes)
+
+
+def _limbs(moves: mi.Bool, n: mi.Vector3f, cos: mi.Float) -> mi.Float:
+    """Return, for each node of the grid, the share of the flow for which there is a reason: 1 near silhouettes.
+
+    Moving surfaces that are curved are seen at grazing angles near the node. Walls and floors have no silhouettes, and
+    need no flow.
+    """
+    around = NodeSums.of(dr.select(moves, mi.Float(1), 0), wide=True)
+    count = dr.maximum(around.total(), dr.smallest(mi.Float))
+    mean = mi.Vector3f(*(around.of_values(n[k]) / count for k in range(3)))
+    grazing = around.of_values(dr.select(cos < STEEP, mi.Float(1), 0)) / count
+    return dr.clip(grazing / ENOUGH, 0, 1) * dr.clip((1 - dr.squared_norm(mean)) / ENOUGH, 0, 1)
+
+
+def _away_from_lights(trace: TraceConfig, sensor: mi.Sensor) -> mi.Float:
+    """Return, for each node of the grid, the share of the flow that static lights leave: see `lights`."""
+    seen = SeenLights.of(trace.scene, sensor)
+    return seen.share_kept(seen.sky | (seen.shape & ~may_move(trace, seen.hit)))
 
 
 def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
