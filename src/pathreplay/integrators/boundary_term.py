@@ -143,7 +143,7 @@ class Boundary(Term):
             yield PrimarySearch.of(trace, places, length).find(n, on_film, seed)
             if trace.media is not None and trace.traits.hard_lights:
                 yield VolumetricSearch.of(trace, places, length).find(n, on_film, seed)
-        if self.inner:
+        if self.inner and trace.max_depth > 1:
             search = SecondarySearch.of(trace, places, INNER_LENGTHS)
             yield search.find(n, max(n // (NARROW_CLOSER if search.most_arcs > 1 else INNER_CLOSER), 1), seed)
             if trace.media is not None and trace.traits.hard_lights and trace.max_depth > 2:
