@@ -24,9 +24,9 @@ the boundary of a hard shadow moves along the ray. This motion is not differenti
 BY_APERTURE = frozenset({"DistantSensorImpl"})
 """Classes of sensors whose rays depend on the aperture sample only. The film position takes its place here, so that
 rays differ between film positions."""
-PIXELS = 32
-"""Resolution assumed for a sensor of `BY_APERTURE`. Its single pixel contains the whole scene, and a segment of half a
-pixel would miss most objects."""
+PIXELS = {"DistantSensorImpl": 32, "IrradianceMeter": 8}
+"""Resolution assumed for sensors of which each pixel sees the whole scene: a segment of half a pixel would miss most
+objects."""
 QUADRATURE = 128
 """Number of quadrature points of the integral over a filter."""
 
@@ -51,7 +51,7 @@ class FilmPlaces:
         sensor, sampler, position = self.view.sensor, CounterSampler.stream(key, Stream.CAMERA), self.in_sensor(s)
         time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = sampler.next_1d(), sampler.next_2d()
-        if self.is_coarse:
+        if self.goes_by_aperture:
             aperture = position
         ray, weight = self.view.camera_ray(time, wavelength, position, aperture)
         return mi.Ray3f(ray), dr.detach(weight)
@@ -62,14 +62,14 @@ class FilmPlaces:
         return self.view.sensor.class_name() not in SINGLE_RAY
 
     @property
-    def is_coarse(self) -> bool:
-        """Whether a single pixel contains the whole scene."""
+    def goes_by_aperture(self) -> bool:
+        """Whether the aperture sample takes the place of the film position: see `BY_APERTURE`."""
         return self.view.sensor.class_name() in BY_APERTURE
 
     @property
     def detail(self) -> float:
-        """Size in pixels of the details that the sensor sees: 1 unless `is_coarse`."""
-        return 1 / PIXELS if self.is_coarse else 1.0
+        """Size in pixels of the details that the sensor sees: see `PIXELS`."""
+        return 1 / PIXELS.get(self.view.sensor.class_name(), 1)
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
         flow = self.view.flow
