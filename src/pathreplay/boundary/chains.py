@@ -97,16 +97,17 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
 
 def _probe_vertex(trace: TraceConfig, path: PathState, key: mi.UInt32, active: mi.Bool) -> VisibilityProbe:
     at = path.at
-    flags = compat.shading() if trace.traits.coarse_meshes else compat.shading_frame()
+    traits = trace.traits
+    flags = compat.shading() if traits.coarse_meshes or traits.brushed_meshes else compat.shading_frame()
     si = at.hit.compute_surface_interaction(at.ray, flags, active)
-    if not trace.traits.copies:
+    if not traits.copies:
         si.shape = at.hit.shape
     away = dr.select(turned_away(si, at.ray.d), mi.UInt32(1), 0)
     probe = VisibilityProbe(mixed(place_met(trace, at.hit, active, si.shape), away), si.p, si.n)
-    if not trace.traits.coarse_meshes:
+    if not (traits.coarse_meshes or traits.brushed_meshes):
         return probe
     triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)
-    if trace.traits.brushed_meshes:  # the tangents of anisotropic lobes jump at every edge between triangles
+    if traits.brushed_meshes:  # the tangents of anisotropic lobes jump at every edge between triangles
         return replace(probe, signature=mixed(probe.signature, triangle))
     light, lobe = _scattered(trace, path, steady(si, at.ray, active), key, active)
     return replace(probe, triangle=triangle, light=light, lobe=lobe)

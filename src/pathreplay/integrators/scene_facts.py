@@ -25,7 +25,9 @@ from pathreplay.transport.facts.traits import (
     Traits,
     blend_lengths,
     emitter_bounds,
+    facets_of,
     fixed_traits,
+    is_smooth_mesh,
     is_veil,
     scene_bounds,
     smoothing_groups_of,
@@ -51,6 +53,8 @@ class SceneFacts:
             if is_mesh(shape) and shape.face_count() == 0:
                 raise PathreplayError(f"pathreplay: mesh '{shape.id()}' has no faces, and cannot be traced: remove it")
         self._boxes = [shape.bbox() for shape in self._shapes]
+        self._smooth = [shape for shape in self._shapes if is_smooth_mesh(shape)]
+        self._vertices = list(map(compat.positions_array, self._smooth))
         self._faces = _faces(self._shapes)
         self._placed = scene.shapes()
         self._lights = scene.emitters()
@@ -115,10 +119,22 @@ class SceneFacts:
         """Return the current values that kernels treat as constants.
 
         These are the parameters that Mitsuba stores as plain numbers, such as the ``eta`` of `dielectric`, the lobes of
-        BSDFs, and the values of `GridMedium.constants`.
+        BSDFs, whether meshes are coarse, and the values of `GridMedium.constants`.
         """
+        self._update_facets()
+        facets = self._traits.coarse_meshes, self._traits.brushed_meshes
         of_media = tuple(medium.constants for medium in self._media if hasattr(medium, "constants"))
-        return (*of_media, *map(plain_numbers, self._with_constants), *(bsdf.flags() for bsdf in self._bsdfs))
+        return (*facets, *of_media, *map(plain_numbers, self._with_constants), *(bsdf.flags() for bsdf in self._bsdfs))
+
+    def _update_facets(self) -> None:
+        """Update `Traits.coarse_meshes` and `Traits.brushed_meshes` if vertices changed, except in a recording."""
+        if is_recording():
+            return
+        vertices = list(map(compat.positions_array, self._smooth))
+        if [array.index for array in vertices] != [array.index for array in self._vertices]:
+            self._vertices = vertices
+            coarse, brushed = facets_of(self._smooth)
+            self._traits = replace(self._traits, coarse_meshes=coarse, brushed_meshes=brushed)
 
     def branches(self) -> bool:
         """Return the current value of `Media.branches`."""
@@ -129,6 +145,7 @@ class SceneFacts:
 
         The traits contain ``tables`` or, by default, the current lookup tables.
         """
+        self._update_facets()
         return replace(
             self._traits,
             tables=self.tables() if tables is None else tables,

@@ -150,6 +150,15 @@ def mesh_arrays(params: Mapping[str, object]) -> MeshArrays | None:
     return MeshArrays(np.array(params[_FACES]).reshape(-1, 3), positions[at], normals, texcoords)
 
 
+def positions_array(mesh: mi.Mesh) -> mi.Float:
+    """Return the vertex positions of a mesh as a flat, detached array of Dr.Jit."""
+    if hasattr(mesh, "vertex_positions_buffer"):  # faster, in 3.9
+        return mi.Float(dr.detach(mesh.vertex_positions_buffer()))
+    params = mi.traverse(mesh)
+    positions = dr.detach(next(params[name] for name in POSITIONS if name in params))
+    return mi.Float(positions.array if dr.is_tensor_v(positions) else positions)
+
+
 def faces_array(mesh: mi.Mesh) -> mi.UInt32 | None:
     """Return the faces of a mesh as a flat array of Dr.Jit, or None if they are not accessible (see `mesh_arrays`)."""
     if hasattr(mesh, "faces_buffer"):  # faster, in 3.9
