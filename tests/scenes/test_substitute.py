@@ -89,6 +89,17 @@ def test_failure_leaves_mitsubas_search_paths_alone(tmp_path):
     assert str(mi.file_resolver()) == before
 
 
+def test_after_a_scene_that_cannot_be_loaded_another_is_rendered():
+    """The error keeps its traceback, and the area light of the scene, whose shape was never made, must not stay."""
+    description = mi.cornell_box()
+    description["sensor"]["film"] |= {"width": 8, "height": 8}
+    broken = {**description, "back": {"type": "rectangle", "bsdf": {"type": "diffuse", "nothing": 1.0}}}
+    with pytest.raises(RuntimeError, match="unreferenced property") as told:
+        load_dict_with(broken, {})
+    assert np.array(mi.render(mi.load_dict(description), spp=16)).mean() > 0.1
+    assert told.value.__traceback__ is not None
+
+
 def test_what_mitsuba_would_die_of_or_wait_for_is_told(tmp_path):
     (tmp_path / "deep.xml").write_text('<scene version="3.0.0">' + "<bsdf>" * 50_000 + "</bsdf>" * 50_000 + "</scene>")
     with pytest.raises(PathreplayError, match="nested elements"):

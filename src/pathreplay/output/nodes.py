@@ -16,11 +16,10 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.registration import PLUGINS
-from pathreplay.platform.threads import spare_thread
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
-from pathreplay.scenes.substitute import exchange, parsing
+from pathreplay.scenes.substitute import exchange, instantiated, parsing
 
 Node: TypeAlias = "mi.parser.SceneNode"
 
@@ -144,8 +143,7 @@ def _owners(config: mi.parser.ParserConfig, state: mi.parser.ParserState, nodes:
     names = {f"object {i}": i for i in range(1, len(nodes))}
     for name, i in names.items():
         copy.nodes[i].props.set_id(name)
-    with spare_thread():
-        scene = mi.parser.instantiate(config, copy)
+    scene = instantiated(config, copy)
     params = traversed(scene)
     owners = []
     for key in params.keys():

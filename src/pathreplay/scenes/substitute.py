@@ -111,5 +111,18 @@ def _instantiate(
             exchanged.append(f"{node.props.id() or 'unnamed'} ({mi.parser.file_location(state, node)})")
     require_sound_files(state)
     mi.parser.transform_all(config, state)
-    with spare_thread():
-        return mi.parser.instantiate(config, state), exchanged
+    return instantiated(config, state), exchanged
+
+
+def instantiated(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -> mi.Scene:
+    """Create the objects of a parsed scene. If this fails, the objects that were created already are deleted.
+
+    Dr.Jit traces virtual calls through every live instance. An area light whose shape is missing would crash the next
+    image of any scene (SIGSEGV), as long as a traceback keeps ``state`` alive.
+    """
+    try:
+        with spare_thread():
+            return mi.parser.instantiate(config, state)
+    except Exception:
+        state.nodes = type(state.nodes)()
+        raise
