@@ -136,6 +136,22 @@ def test_a_grid_in_the_box_of_its_file_comes_out_in_that_box(source: str, tmp_pa
     assert load_volume(tmp_path / f"out/volumes/{key}.vol").bounds() == box
 
 
+def with_picture(picture: dict[str, Any]) -> dict[str, Any]:
+    """A box whose back is painted with a bitmap."""
+    scene = BUILTINS["cornell-box"](resolution=8)
+    scene["back"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "bitmap", **picture}}
+    return scene
+
+
+def test_a_dictionary_with_a_tensor_comes_out_and_stays_whole(tmp_path: Path) -> None:
+    """`mi.load_dict` moves tensors out of the dictionary that it loads."""
+    texels = np.linspace(0.1, 0.9, 4 * 5 * 3, dtype=np.float32).reshape(4, 5, 3)
+    scene = with_picture({"raw": True, "data": mi.TensorXf(texels)})
+    found = exported(Source(scene, {}, {}, {}), {"red.reflectance.value": np.float32([0.2, 0.3, 0.8])})
+    same_pictures(found, tmp_path / "out")
+    np.testing.assert_array_equal(scene["back"]["bsdf"]["reflectance"]["data"], texels)
+
+
 def test_the_index_of_glass_comes_out_as_that_of_mitsubas_plugin(tmp_path: Path) -> None:
     source = Source(BUILTINS["glass-ball"](resolution=8), {}, {"dielectric": "dielectric_ad"}, {})
     found = exported(source, {"glass.eta": np.float32([1.31])})

@@ -17,7 +17,7 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.registration import PLUGINS
 from pathreplay.platform.traversal import traversed
-from pathreplay.scenes.descriptions import require_values
+from pathreplay.scenes.descriptions import copied, require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 from pathreplay.scenes.substitute import exchange, instantiated, parsing
 
@@ -87,7 +87,7 @@ def describe(
     with parsing(folder) as config:
         if isinstance(scene, Mapping):
             require_values(scene)
-            state = mi.parser.parse_dict(config, dict(scene))
+            state = mi.parser.parse_dict(config, copied(scene))
         else:
             require_shallow(Path(scene))
             state = mi.parser.parse_file(config, str(scene), **arguments)

@@ -6,9 +6,11 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
+import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
+from pathreplay.types import SceneDict
 
 
 def require_values(description: Mapping[str, object]) -> None:
@@ -20,6 +22,26 @@ def require_values(description: Mapping[str, object]) -> None:
             )
         if isinstance(value, Mapping):
             require_values(value)
+
+
+def copied(description: Mapping[str, object]) -> SceneDict:
+    """Copy a dictionary, its tensors and its bitmaps.
+
+    When Mitsuba loads a dictionary, it moves the tensors out of it, and converts bitmaps in place in spectral variants.
+    Raises PathreplayError for a dictionary that Mitsuba has loaded before, if tensors are missing from it.
+    """
+
+    def copy(value: object) -> object:
+        if isinstance(value, Mapping):
+            return copied(value)
+        if dr.is_tensor_v(value) and len(value.array) == 0:
+            raise PathreplayError(
+                "The scene's dictionary contains an empty tensor; if mi.load_dict has loaded the dictionary before, it "
+                "has moved the tensors into that scene: give the scene, or build the dictionary again"
+            )
+        return type(value)(value) if dr.is_array_v(value) or isinstance(value, mi.Bitmap) else value
+
+    return {name: copy(value) for name, value in description.items()}
 
 
 def load_integrator(description: Mapping[str, object]) -> mi.Integrator:

@@ -10,7 +10,6 @@ from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError, shown
@@ -58,7 +57,7 @@ def load_scene_with(
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if isinstance(spec, Mapping):
         with errors_as("The scene's dictionary cannot be loaded", (RuntimeError, ValueError, TypeError)):
-            scene, exchanged = load_dict_with(_copied(spec), plugins, cameras, floats)
+            scene, exchanged = load_dict_with(spec, plugins, cameras, floats)
         if not isinstance(scene, mi.Scene):
             raise PathreplayError(f"The dictionary describes a {type(scene).__name__}, not a scene; give a 'scene'")
         return scene, exchanged
@@ -76,26 +75,6 @@ def load_scene_with(
     if not isinstance(scene, mi.Scene):
         raise PathreplayError(f"{path} describes a {type(scene).__name__}, not a <scene>; wrap it in <scene>")
     return scene, exchanged
-
-
-def _copied(description: Mapping[str, object]) -> SceneDict:
-    """Copy a dictionary, its tensors and its bitmaps.
-
-    When Mitsuba loads a dictionary, it moves the tensors out of it, and converts bitmaps in place in spectral variants.
-    Raises PathreplayError for a dictionary that Mitsuba has loaded before, if tensors are missing from it.
-    """
-
-    def copied(value: object) -> object:
-        if isinstance(value, Mapping):
-            return _copied(value)
-        if dr.is_tensor_v(value) and len(value.array) == 0:
-            raise PathreplayError(
-                "The scene's dictionary contains an empty tensor; if mi.load_dict has loaded the dictionary before, it "
-                "has moved the tensors into that scene: give the scene, or build the dictionary again"
-            )
-        return type(value)(value) if dr.is_array_v(value) or isinstance(value, mi.Bitmap) else value
-
-    return {name: copied(value) for name, value in description.items()}
 
 
 def as_xml_has_them(parameters: Mapping[str, object]) -> dict[str, str]:

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.threads import spare_thread
-from pathreplay.scenes.descriptions import require_values
+from pathreplay.scenes.descriptions import copied, require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 
 Cameras = Mapping[str, Mapping[str, object]]
@@ -57,11 +57,12 @@ def load_dict_with(
 ) -> tuple[mi.Scene, list[str]]:
     """Load a dictionary like `mi.load_dict(scene, optimize=False)`, with the arguments of `load_file_with`.
 
-    Objects in the dictionary that are already loaded are not changed. Raises PathreplayError for a value of None.
+    The dictionary is copied (see `copied`), and objects in it that are already loaded are not changed. Raises
+    PathreplayError for a value of None.
     """
     require_values(scene)
     with parsing(None) as config:
-        return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins, cameras, floats)
+        return _instantiate(config, mi.parser.parse_dict(config, copied(scene)), plugins, cameras, floats)
 
 
 def exchange(props: mi.Properties, plugins: Mapping[str, str], floats: Collection[str]) -> bool:
