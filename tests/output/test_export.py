@@ -152,6 +152,37 @@ def test_a_dictionary_with_a_tensor_comes_out_and_stays_whole(tmp_path: Path) ->
     np.testing.assert_array_equal(scene["back"]["bsdf"]["reflectance"]["data"], texels)
 
 
+BYTES = np.random.default_rng(0).integers(0, 255, (4, 5, 3), np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["sRGB", "raw", "linear"])
+def test_a_bitmap_of_bytes_comes_out_as_it_is(kind: str, tmp_path: Path) -> None:
+    bitmap = mi.Bitmap(BYTES)
+    bitmap.set_srgb_gamma(kind != "linear")
+    found = exported(Source(with_picture({"bitmap": bitmap, "raw": kind == "raw"}), {}, {}, {}), {})
+    same_pictures(found, tmp_path / "out")
+    texels = mi.traverse(loaded(tmp_path / "out"))["back.bsdf.reflectance.data"]
+    np.testing.assert_array_equal(np.array(texels), BYTES)
+
+
+@pytest.mark.parametrize("source", ["a file", "a bitmap"])
+def test_a_recovered_texture_of_bytes_comes_out_in_floats(source: str, tmp_path: Path) -> None:
+    mi.Bitmap(BYTES).write(str(tmp_path / "bytes.png"))
+    picture = {"filename": str(tmp_path / "bytes.png")} if source == "a file" else {"bitmap": mi.Bitmap(BYTES)}
+    key, texels = "back.bsdf.reflectance.data", np.linspace(0.1, 0.9, 60, dtype=np.float32).reshape(4, 5, 3)
+    same_pictures(exported(Source(with_picture(picture), {}, {}, {}), {key: texels}), tmp_path / "out")
+    np.testing.assert_allclose(np.array(mi.traverse(loaded(tmp_path / "out"))[key]), texels, rtol=1e-6)
+
+
+def test_integers_and_floats_of_the_same_values_are_told_apart(tmp_path: Path) -> None:
+    found = exported(Source(with_picture({"bitmap": mi.Bitmap(BYTES)}), {}, {}, {}), {})
+    (tmp_path / "out").mkdir()
+    write_files(found, tmp_path / "out")
+    floats = with_picture({"raw": True, "data": mi.TensorXf(BYTES.astype(np.float32))})
+    with pytest.raises(PathreplayError, match=r"'back\.bsdf\.reflectance\.data' of Bitmap.* is missing or different"):
+        require_same(mi.load_dict(floats, optimize=False), tmp_path / "out")
+
+
 def test_the_index_of_glass_comes_out_as_that_of_mitsubas_plugin(tmp_path: Path) -> None:
     source = Source(BUILTINS["glass-ball"](resolution=8), {}, {"dielectric": "dielectric_ad"}, {})
     found = exported(source, {"glass.eta": np.float32([1.31])})

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import gc
 import io
 import json
 import math
 import shlex
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -27,11 +25,10 @@ from pathreplay.output.scene_folder import SCENE, Exported, Source, exported, re
 from pathreplay.platform import backend, compat
 from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.platform.files import file_names
-from pathreplay.platform.traversal import traversed
 from pathreplay.runs.run_folder import IN_MEMORY, Job, read_job, require_writable_name, resume_command
 from pathreplay.scenes.builtin import BUILTINS
-from pathreplay.scenes.descriptions import errors_as, load_integrator
-from pathreplay.scenes.loading import as_xml_has_them, builtin_dict, coarse_pictures
+from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.scenes.loading import as_xml_has_them, builtin_dict
 from pathreplay.scenes.parameters import get_array
 from pathreplay.types import Json
 
@@ -137,8 +134,7 @@ def _source(job: Job, values: Arrays) -> Source:
     path = job.base / config.scene
     if not path.is_file():
         raise PathreplayError(f"Scene {path} of the run no longer exists; restore it")
-    source = Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras, medium=medium)
-    return replace(source, floats=_floats(source, values))
+    return Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras, medium=medium)
 
 
 def _integrator(job: Job) -> Json | None:
@@ -155,20 +151,6 @@ def _integrator(job: Job) -> Json | None:
         except PathreplayError:  # the integrator was an object, of which the config has only the name of the class
             return None
     return options
-
-
-def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
-    """Return the image files of optimized textures that Mitsuba would load as 8-bit integers.
-
-    The run stored the texels of these files as floating-point numbers, and the export must store them in the same way.
-    """
-    keys = [key for key in values if key.endswith(".data")]
-    if not keys:
-        return ()
-    with errors_as("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
-        pictures = coarse_pictures(traversed(source.load()), keys)
-    gc.collect()  # free the scene: Dr.Jit traces virtual calls through every instance in memory
-    return pictures
 
 
 def _beside(export: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:

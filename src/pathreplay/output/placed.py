@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -14,6 +15,7 @@ from pathreplay.output.nodes import Described, Node, Owner
 from pathreplay.platform import compat
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.parameters import get_array
+from pathreplay.scenes.spectra import coefficient_channels
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.volume_files import UNIT_CUBE, Bounds, vol_bounds, vol_bytes
 
@@ -44,12 +46,14 @@ _PLAIN_SPECTRA = ("SRGBReflectanceSpectrum", "UniformSpectrum")
 class Placing:
     """Writes the current values of a scene into its description.
 
-    ``names`` are file names by parameter key. ``files`` collects the content of the files that the description needs,
-    by name.
+    ``names`` are file names by parameter key, and ``recovered`` contains the keys of recovered parameters. ``files``
+    collects the content of the files that the description needs, by name.
     """
 
-    def __init__(self, described: Described, scene: mi.Scene, names: dict[str, str]) -> None:
-        self.described, self.scene, self.names = described, scene, names
+    def __init__(
+        self, described: Described, scene: mi.Scene, names: dict[str, str], recovered: Collection[str]
+    ) -> None:
+        self.described, self.scene, self.names, self.recovered = described, scene, names, recovered
         self.params = traversed(scene)
         self.files: dict[str, bytes] = {}
         self.owners: set[int] = set()
@@ -81,17 +85,29 @@ class Placing:
                     self._made_mesh(parent, name, value)
 
     def _texture(self, key: str, node: Node) -> None:
-        if mi.is_spectral:
+        value = self.params[key]
+        if not dr.is_float_v(value):
+            self._coarse_texture(key, node)
+            return
+        if coefficient_channels(self.params, key):
+            remedy = "recover it in an rgb variant" if key in self.recovered else "give it as a file"
             raise PathreplayError(
                 f"Texture '{key}' consists of smooth spectra in variant {mi.variant()}, which no file format of "
-                "Mitsuba holds; recover it in an rgb variant"
+                f"Mitsuba holds; {remedy}"
             )
-        value = self.params[key]
         self._from_file(
             node, f"textures/{self.names[key]}.exr", exr_bytes(get_array(form_of(self.params, key).see(value)))
         )
         if node.props.plugin_name() == "bitmap":
             node.props["format"] = "fp16" if isinstance(value, mi.TensorXf16) else "variant"
+
+    def _coarse_texture(self, key: str, node: Node) -> None:
+        """Write 8-bit texels to a PNG file, whose values Mitsuba decodes from sRGB unless ``raw`` is set."""
+        if not node.props.get("bitmap").srgb_gamma():
+            node.props["raw"] = True
+        stream = mi.MemoryStream()
+        mi.Bitmap(self.params[key]).write(stream, mi.Bitmap.FileFormat.PNG)
+        self._from_file(node, f"textures/{self.names[key]}.png", bytes(stream.raw_buffer()))
 
     def _volume(self, key: str, node: Node) -> None:
         bounds = UNIT_CUBE

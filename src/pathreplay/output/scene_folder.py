@@ -24,6 +24,7 @@ from pathreplay.platform.registration import PLUGINS
 from pathreplay.platform.threads import spare_thread
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import errors_as
+from pathreplay.scenes.loading import coarse_pictures
 from pathreplay.scenes.parameters import UNNAMED, get_array, is_empty, to_value
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
@@ -54,17 +55,18 @@ class Source:
     """New plugin types by the old types that they replace."""
     cameras: Mapping[str, Mapping[str, object]]
     """Additional sensors by id."""
-    floats: Collection[str] = ()
-    """Image files whose textures are stored as floating-point numbers; see `load_file_with`."""
     medium: str | None = None
     """Id of the medium that surrounds the additional sensors."""
 
-    def load(self) -> mi.Scene:
-        """Load the scene. Raises the errors of Mitsuba, of `load_file_with` and of `put_inside`."""
+    def load(self, floats: Collection[str] = ()) -> mi.Scene:
+        """Load the scene; `load_file_with` describes ``floats``.
+
+        Raises the errors of Mitsuba, of `load_file_with` and of `put_inside`.
+        """
         if isinstance(self.scene, Mapping):
-            scene = load_dict_with(self.scene, self.plugins, self.cameras, self.floats)[0]
+            scene = load_dict_with(self.scene, self.plugins, self.cameras, floats)[0]
         else:
-            scene = load_file_with(self.scene, self.plugins, self.arguments, self.cameras, self.floats)[0]
+            scene = load_file_with(self.scene, self.plugins, self.arguments, self.cameras, floats)[0]
         if self.medium is not None:
             put_inside(scene, set(self.cameras), self.medium)
         return scene
@@ -99,15 +101,16 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
         PathreplayError: a Mitsuba scene file cannot describe a part of the scene.
     """
     with errors_as("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
-        scene = source.load()
+        scene, floats = _loaded(source, values)
         params = _set(scene, values)
         described, owners = describe(
-            source.scene, source.arguments, source.plugins, source.cameras, source.floats, source.medium
+            source.scene, source.arguments, source.plugins, source.cameras, floats, source.medium
         )
     keys = list(params.keys())
     if len(keys) != len(owners):
         raise PathreplayError("The scene differs each time it is loaded, and cannot be exported")
-    placing = Placing(described, scene, file_names([*keys, *(shape.id() for shape in scene.shapes())]))
+    names = file_names([*keys, *(shape.id() for shape in scene.shapes())])
+    placing = Placing(described, scene, names, values)
     for key, owner in zip(keys, owners, strict=True):
         if owner.node is described.nodes[0]:  # the parameter belongs to an existing mesh object: `meshes` writes it
             continue
@@ -147,6 +150,8 @@ def require_same(original: mi.Scene, folder: Path) -> None:
 def _alike(value: object, other: object) -> bool:
     if isinstance(value, (bool, int, str)) or isinstance(other, (bool, int, str)):
         return bool(value == other)
+    if dr.is_array_v(value) and dr.is_array_v(other) and dr.is_float_v(value) != dr.is_float_v(other):
+        return False
     try:
         a, b = (_numbers(x) for x in (value, other))
     except (TypeError, ValueError):
@@ -166,6 +171,20 @@ def _numbers(value: Any) -> np.ndarray:
     if dr.is_array_v(value) or isinstance(value, float) or hasattr(value, "matrix"):
         return np.zeros(0) if not isinstance(value, float) and is_empty(value) else get_array(value)
     return np.array(value, np.float64)
+
+
+def _loaded(source: Source, values: Arrays) -> tuple[mi.Scene, tuple[str, ...]]:
+    """Load the scene, and return it with the names of the image files whose texels are stored as floats.
+
+    These are the 8-bit textures that have a value, whose texels runs store as floats, too.
+    """
+    scene = source.load()
+    floats = coarse_pictures(traversed(scene), values)
+    if floats:
+        del scene
+        gc.collect()  # Dr.Jit traces virtual calls through every instance in memory
+        scene = source.load(floats)
+    return scene, floats
 
 
 def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
