@@ -144,6 +144,28 @@ def test_frames_without_an_image_are_left_out(capture: Path, tmp_path: Path) -> 
         find_photos(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("matrix", "told"),
+    [
+        (np.diag([2.0, 2, 2, 1]), r"its axes have the lengths 2, 2, 2\)"),
+        (np.array([[1, 0.6, 0, 0], [0, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), r"its axes are not at right angles"),
+        (np.diag([-1.0, 1, 1, 1]), r"it mirrors"),
+        (np.diag([1.0, 1, 1, 2]), r"its last row is \[0\.0, 0\.0, 0\.0, 2\.0\]"),
+    ],
+)
+def test_poses_that_are_not_rigid_are_told_of_the_own_file(
+    matrix: np.ndarray, told: str, capture: Path, tmp_path: Path
+) -> None:
+    places = cameras()
+    places[2] = places[2] @ matrix
+    frames = [{"file_path": str(capture / f"{k}.png"), "transform_matrix": m.tolist()} for k, m in enumerate(places)]
+    write(tmp_path, frames)
+    with pytest.raises(PathreplayError, match=told) as error:
+        pathreplay.from_photos(tmp_path, tmp_path / "job", minutes=0.01)
+    assert str(error.value).startswith(f"{tmp_path}/transforms.json: frame")
+    assert not (tmp_path / "job").exists()
+
+
 def test_what_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(PathreplayError, match=r"neither transforms.json nor a COLMAP model .* recover the poses"):
         find_photos(tmp_path)

@@ -26,8 +26,6 @@ from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.platform.files import file_names, file_problem
 from pathreplay.types import SceneDict
 
-STRAIGHT = 1e-3
-"""Tolerance on the orthonormality of the axes of a camera."""
 FACING = np.diag([-1.0, 1.0, -1.0, 1.0])
 """Transform from Mitsuba's to OpenGL's camera axes."""
 
@@ -131,16 +129,9 @@ def view_names(files: list[str]) -> list[str]:
 
 def _camera(photo: Photo, size: tuple[int, int], capture: Capture, pixel_format: str) -> SceneDict:
     """Make the Mitsuba dictionary of the pinhole camera of a photo."""
-    lens, axes = photo.lens, photo.place[:3, :3]
-    if (
-        np.abs(axes.T @ axes - np.eye(3)).max() > STRAIGHT
-        or np.linalg.det(axes) < 0
-        or (photo.place[3] != [0, 0, 0, 1]).any()
-    ):
-        raise PathreplayError(f"{photo.where} has a transform_matrix that is not a rigid motion; correct it")
     columns = size[0] if capture.width is None else capture.width
     rows = max(1, round(columns * size[1] / size[0]))
-    return pinhole_camera(lens, photo.place, (columns, rows), capture.near_clip, pixel_format)
+    return pinhole_camera(photo.lens, photo.place, (columns, rows), capture.near_clip, pixel_format)
 
 
 def pinhole_camera(

@@ -22,6 +22,8 @@ from pathreplay.types import Json
 MOST_BYTES = 64 * 2**20
 ENDINGS = (".png", ".jpg", ".jpeg", ".exr")
 """Suffixes to try for images that are named without a suffix, as in the original NeRF scenes."""
+STRAIGHT = 1e-3
+"""Tolerance on the orthonormality of the axes of a camera."""
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 Row = Annotated[list[Annotated[FiniteFloat, Field(gt=-1e9, lt=1e9)]], Field(min_length=4, max_length=4)]
@@ -89,8 +91,27 @@ def photos_of_json(
         where = f"{path}: frame {shown(frame.file_path)}"
         mask = None if frame.mask_path is None else _picture(frame.mask_path, path)
         lens = _lens(where, table, size_of(image))
-        photos.append(Photo(where, frame.file_path, image, mask, lens, np.array(frame.transform_matrix)))
+        photos.append(Photo(where, frame.file_path, image, mask, lens, _place(where, frame.transform_matrix)))
     return photos
+
+
+def _place(where: str, rows: list[list[float]]) -> np.ndarray:
+    """Return the camera-to-world matrix. Raises PathreplayError if it is not a rigid motion."""
+    place = np.array(rows)
+    products = place[:3, :3].T @ place[:3, :3]
+    lengths = np.sqrt(products.diagonal())
+    wrong = ""
+    if rows[3] != [0, 0, 0, 1]:
+        wrong = f"its last row is {rows[3]}"
+    elif np.abs(lengths**2 - 1).max() > STRAIGHT:
+        wrong = f"its axes have the lengths {', '.join(f'{length:.4g}' for length in lengths)}"
+    elif np.abs(products - np.eye(3)).max() > STRAIGHT:
+        wrong = "its axes are not at right angles"
+    elif np.linalg.det(place[:3, :3]) < 0:
+        wrong = "it mirrors"
+    if wrong:
+        raise PathreplayError(f"{where} has a transform_matrix that is not a rigid motion ({wrong}); correct it")
+    return place
 
 
 def _read(path: Path) -> _Transforms:
