@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
+import PIL.Image
 import pytest
 
 import pathreplay
@@ -142,6 +144,18 @@ def test_frames_without_an_image_are_left_out(capture: Path, tmp_path: Path) -> 
     write(tmp_path, [{**frames[0], "file_path": "lost.png"}, *frames[:2]])
     with pytest.raises(PathreplayError, match=r"2 of 3 images exist in .*; add the image files"):
         find_photos(tmp_path)
+
+
+def test_ignored_metadata_of_photos_is_told(capture: Path, tmp_path: Path) -> None:
+    """A photo that a phone has marked as turned by 90 degrees."""
+    shutil.copytree(capture, tmp_path / "turned")
+    turned = PIL.Image.Exif()
+    turned[274] = 6
+    for name in ("1.png", "2.png"):
+        with PIL.Image.open(capture / name) as picture:
+            picture.save(tmp_path / "turned" / name, exif=turned)
+    notes = pathreplay.from_photos(tmp_path / "turned", tmp_path / "job", minutes=0.01).notes
+    assert any(note.startswith("photo '1.png' (and 1 others) has an Exif orientation: it is ignored") for note in notes)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from pathreplay.inverse.images.disk_store import ROOM, DiskStore
 from pathreplay.inverse.images.io import (
     Image,
     find_image,
-    oddities,
+    notes_on_metadata,
     over,
     over_black,
     picture_size,
@@ -165,13 +165,12 @@ def read_targets(
     targets: dict[str, Image] = {}
     weights: dict[str, Image] = {}
     notes: list[str] = []
-    odd: dict[str, list[str]] = {}
+    paths: dict[str, Path] = {}
     for name, file in files.items():
         path, what = find_image(file, base), f"Target image '{file}'"
         shape = picture_shape(scene.sensors()[sensors[name]])
         image = _read(what, path, name, shape, how.resize)
-        for oddity in oddities(path):
-            odd.setdefault(oddity, []).append(file)
+        paths[file] = path
         _require_alpha(what, image, alpha, name, shape)
         # Premultiply before resampling, since the colours of transparent pixels are arbitrary.
         image = over_black(image, path)
@@ -202,10 +201,7 @@ def read_targets(
     if lenses:
         kinds = ", ".join(sorted({lens.describe() for lens in lenses.values()}))
         notes.append(f"images undistorted to a pinhole camera: {len(lenses)}, taken with {kinds}")
-    notes += [
-        f"target image '{files[0]}'{f' (and {len(files) - 1} others)' if len(files) > 1 else ''} {oddity}"
-        for oddity, files in odd.items()
-    ]
+    notes += notes_on_metadata("target image", paths)
     return Targets(targets, weights), tuple(notes)
 
 

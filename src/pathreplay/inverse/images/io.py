@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -173,7 +173,22 @@ def picture_size(path: Path) -> tuple[int, int]:
     return size
 
 
-def oddities(path: Path) -> list[str]:
+def notes_on_metadata(what: str, files: Mapping[str, Path]) -> list[str]:
+    """Return a line for the user per kind of ignored metadata, such as an Exif orientation.
+
+    ``what`` says what the images are, and ``files`` contains their paths by name.
+    """
+    odd: dict[str, list[str]] = {}
+    for name, path in files.items():
+        for oddity in _oddities(path):
+            odd.setdefault(oddity, []).append(name)
+    return [
+        f"{what} '{names[0]}'{f' (and {len(names) - 1} others)' if len(names) > 1 else ''} {oddity}"
+        for oddity, names in odd.items()
+    ]
+
+
+def _oddities(path: Path) -> list[str]:
     """Describe ignored metadata of an image. Each description is a predicate whose subject is the image."""
     notes = []
     # `read_image` reports errors. Pillow's warnings about large images are irrelevant here.

@@ -16,7 +16,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.dataset.capture import pinhole_camera
-from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.inverse.images.io import exr_bytes, notes_on_metadata
 from pathreplay.jobs.photographs.job_text import Choices, field_scene, job_text, mesh_scene
 from pathreplay.jobs.photographs.mesh import GREY, Proxy, read_proxy
 from pathreplay.jobs.photographs.pictures import Frame, Prepared, frames_of, prepare
@@ -87,7 +87,7 @@ def from_photos(
     _require_options(minutes, test_every, width)
     backend.set_variant(None)
     output, found = Path(output), find_photos(Path(folder))
-    notes = found.notes()
+    notes = found.notes() + notes_on_metadata("photo", {photo.name: photo.image for photo in found.photos})
     trained = len(found.photos) - len(range(0, len(found.photos), test_every))
     frames = frames_of(found.photos, width)
     tell(f"{len(frames)} photos of {found.source}: {trained} to train, {len(frames) - trained} test views")
