@@ -24,6 +24,7 @@ from pathreplay.jobs.photographs.pictures import BLOCK, frames_of, prepare
 from pathreplay.jobs.photographs.plan import LEAST, Speed, plan_stages
 from pathreplay.jobs.photographs.reading import find_photos
 from pathreplay.jobs.photographs.region import find_region, sky_rows
+from pathreplay.jobs.photographs.timing import measure, measure_poses
 from pathreplay.output.surface_scene import export_surface
 
 VIEWS, SIZE, FOV = 10, 32, 0.75
@@ -271,6 +272,21 @@ def test_stages_fit_into_the_time() -> None:
     short = plan_stages(speed, 0.2, 40, 160, 280)
     assert len(short) < len(plan)
     assert all(stage.iterations >= LEAST for stage in plan + short)
+
+
+def test_stages_that_refine_poses_are_planned_with_their_own_speed() -> None:
+    speed, posed = Speed(samples=9e6, tracing=0.05, compiling=1.0), Speed(samples=9e5, tracing=0.6, compiling=10.0)
+    free, refined = (plan_stages(speed, 30, 40, 160, 280, each) for each in (None, posed))
+    assert free[0].spp == refined[0].spp and free[0].iterations > refined[0].iterations > 0.4 * free[0].iterations
+    assert all(b.iterations < 0.5 * a.iterations for a, b in zip(free[1:], refined[1:], strict=True))
+    assert [stage.iterations for stage in plan_stages(speed, 1, 40, 160, 280, posed)] == [LEAST]
+
+
+def test_passes_with_poses_are_measured(capture: Path, tmp_path: Path) -> None:
+    written = pathreplay.from_photos(capture, tmp_path / "job", minutes=0.01)
+    frames = frames_of(find_photos(capture).photos[:3], 16)
+    plain, posed = (way(written.folder / "scene.xml", frames, 1.0) for way in (measure, measure_poses))
+    assert posed.tracing > 2 * plain.tracing
 
 
 def test_a_fast_machine_renders_more_samples_in_about_the_same_number_of_iterations() -> None:

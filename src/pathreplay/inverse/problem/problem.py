@@ -290,11 +290,11 @@ def build_problem(
         _require_gradients(integrator)
     named, derivations = keys_of(params, config.parameters, config.derived, integrator)
     keys = [*named, *derivations]
-    notes += _edges(params, keys, integrator)
+    notes += notes_on_edges(params, keys, integrator)
     baseline = None if config.baseline is None else _gradient_integrator(config.baseline)
     if baseline is not None:
         keys_of(params, config.parameters, config.derived, baseline)
-        _edges(params, keys, baseline)  # only suppresses the note that the baseline would log
+        notes_on_edges(params, keys, baseline)  # only suppresses the note that the baseline would log
     judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     # Cheap checks come before the rendering of targets.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
@@ -474,7 +474,7 @@ def _require_gradients(integrator: mi.Integrator, name: str = "") -> None:
         )
 
 
-def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
+def notes_on_edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
     """Return a note for the user if visibility boundaries move with the parameters.
 
     The note says that boundary terms are expensive, or that the gradient lacks them. The integrator would log a note of

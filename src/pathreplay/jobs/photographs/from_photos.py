@@ -6,7 +6,6 @@ It resamples the photographs to pinhole cameras, and chooses the region of the s
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,17 +14,16 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.inverse.dataset.capture import pinhole_camera
 from pathreplay.inverse.images.io import exr_bytes, notes_on_metadata
 from pathreplay.jobs.photographs.job_text import Choices, field_scene, job_text, mesh_scene
 from pathreplay.jobs.photographs.mesh import GREY, Proxy, read_proxy
-from pathreplay.jobs.photographs.pictures import Frame, Prepared, frames_of, prepare
-from pathreplay.jobs.photographs.plan import Speed, StagePlan, plan_stages
+from pathreplay.jobs.photographs.pictures import Prepared, frames_of, prepare
+from pathreplay.jobs.photographs.plan import StagePlan, plan_stages
 from pathreplay.jobs.photographs.reading import TRANSFORMS, find_photos
 from pathreplay.jobs.photographs.region import Box, find_region, near_clip, sky_rows
+from pathreplay.jobs.photographs.timing import measure, measure_poses
 from pathreplay.platform import backend
 from pathreplay.platform.atomic_files import whole_folder
-from pathreplay.scenes.loading import load_scene
 
 JOB = "job.toml"
 OPTICAL_DEPTH = 1.5
@@ -34,7 +32,6 @@ OPAQUE = 5.0
 """Upper bound of the optical depth of a voxel of the finest grid. The cost of a path grows with the largest density."""
 COARSE = 32
 """Voxels along the longest side of the initial grids; stages resample them."""
-TIMED_SPP = 4
 NO_CLIP = 1e-3
 HEADROOM = 1.3
 """Upper bound of the radiance, relative to the brightest pixel."""
@@ -111,7 +108,8 @@ def from_photos(
         near = near_clip(frames) if proxy is None else NO_CLIP
         speed = measure(part / "scene.xml", frames, near)
         tell(f"this machine renders {speed.samples / 1e6:.2g} million samples per second")
-        stages = plan_stages(speed, minutes, trained, *size)
+        posed = measure_poses(part / "scene.xml", frames, near) if refine_poses else None
+        stages = plan_stages(speed, minutes, trained, *size, posed)
         densest = OPAQUE * stages[-1].resolution / float(region.size.max())
         choices = Choices(has_sky or proxy is not None, refine_poses, near, HEADROOM * prepared.peak, densest)
         key = None if proxy is None else proxy.key
@@ -179,23 +177,3 @@ def _write_start(folder: Path, region: Box, mean: np.ndarray, rows: int, proxy: 
     radiance = np.broadcast_to(mean, (*shape, 3)).astype(np.float32)
     mi.VolumeGrid(density).write(str(start / "density.vol"))
     mi.VolumeGrid(np.ascontiguousarray(radiance)).write(str(start / "radiance.vol"))
-
-
-def measure(scene: Path, frames: Sequence[Frame], near: float) -> Speed:
-    """Measure the seconds to trace and to compile an image of a scene, and the samples per second, on this machine."""
-    frame, loaded = frames[len(frames) // 2], load_scene(scene)
-
-    def seconds(sensor: mi.Sensor, spp: int, seed: int) -> float:
-        begin = time.perf_counter()
-        np.array(mi.render(loaded, sensor=sensor, integrator=loaded.integrator(), spp=spp, seed=seed))
-        return time.perf_counter() - begin
-
-    large, small = (
-        mi.load_dict(pinhole_camera(frame.lens, frame.place, size, near))
-        for size in ((frame.width, frame.height), (8, 8))
-    )
-    first = seconds(small, 1, 0)
-    traced = min(seconds(small, 1, seed) for seed in (1, 2, 3))
-    whole = min(seconds(large, TIMED_SPP, seed) for seed in (1, 2, 3))
-    samples = frame.width * frame.height * TIMED_SPP / max(whole - traced, 0.1 * whole)
-    return Speed(samples, traced, max(first - traced, 0.0))

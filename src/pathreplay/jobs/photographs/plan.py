@@ -58,7 +58,9 @@ class Speed:
     """Seconds to compile the kernels of an image, once per stage."""
 
 
-def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: int) -> list[StagePlan]:
+def plan_stages(
+    speed: Speed, minutes: float, trained: int, width: int, height: int, posed: Speed | None = None
+) -> list[StagePlan]:
     """Choose the stages that fit into a time limit.
 
     If the last stage would have less than `LEAST` iterations, it is left out, and the other stages share its time. This
@@ -70,23 +72,26 @@ def plan_stages(speed: Speed, minutes: float, trained: int, width: int, height: 
         trained: number of training views.
         width: width of the images in pixels.
         height: height of the images in pixels.
+        posed: speed in the stages that refine poses, which are all but the first of several; None without poses.
     """
     seconds, shares = 60 * minutes * USED, dict(SHARES)
     while True:
-        overhead = TRACED * (2 * trained * speed.tracing + speed.compiling)
-        left = max(seconds - len(shares) * overhead, 0.0)
+        first = [k == 0 and len(shares) > 1 for k in range(len(shares))]
+        speeds = [speed if posed is None or alone else posed for alone in first]
+        overhead = TRACED * sum(2 * trained * each.tracing + each.compiling for each in speeds)
+        left = max(seconds - overhead, 0.0)
         stages = []
-        for k, (factor, share) in enumerate(shares.items()):
+        for own, alone, (factor, share) in zip(speeds, first, shares.items(), strict=True):
             pixels = (width // factor) * (height // factor)
             views = min(VIEWS if factor > 1 else VIEWS // 2, trained)
             wanted = min(round(SAMPLES / (views * pixels)), MOST_SPP)
-            cheap = min(int(CHEAP * A_VIEW * speed.samples / (PASSES * pixels)), MOST_CHEAP_SPP)
+            cheap = min(int(CHEAP * A_VIEW * own.samples / (PASSES * pixels)), MOST_CHEAP_SPP)
             spp = max(1, wanted, cheap)
-            step = views * (A_VIEW + spp * PASSES * pixels / speed.samples)
+            step = views * (A_VIEW + spp * PASSES * pixels / own.samples)
             size = min(max(round(RESOLUTION * max(width, height) / factor), COARSEST), FINEST)
             step += VALUES * size**3 * (A_VALUE + views * A_VALUE_OF_VIEW)
             count = int(left * share / sum(shares.values()) / step)
-            stages.append(StagePlan(count, factor, size, views, spp, k == 0 and len(shares) > 1))
+            stages.append(StagePlan(count, factor, size, views, spp, alone))
         if stages[-1].iterations >= LEAST or len(shares) == 1:
             break
         del shares[stages[-1].downscale]
