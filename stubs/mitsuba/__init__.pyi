@@ -6,6 +6,7 @@ here. A misspelt name and an object of the wrong class are errors.
 
 import enum
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, Generic, TypeAlias, TypeVar, overload
 
 import drjit as dr
@@ -259,6 +260,7 @@ _Size: TypeAlias = _Scalar2 | Sequence[int]
 def variant() -> str: ...  # None before one is set
 def variants() -> list[str]: ...
 def set_variant(*names: str) -> None: ...
+def variant_context(*names: str) -> AbstractContextManager[None]: ...
 
 is_spectral: bool
 is_rgb: bool

@@ -6,6 +6,7 @@ import gc
 import json
 import shlex
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -387,6 +388,51 @@ def test_cameras_inside_a_medium_come_out_inside_it(tmp_path: Path) -> None:
     gc.collect()
     with pytest.raises(PathreplayError, match=r"capture\.medium 'mist' is the id of no medium of the scene"):
         exported(replace(source, medium="mist"), {})
+
+
+SPECTRAL = """
+import sys
+from pathlib import Path
+import mitsuba as mi, numpy as np
+from pathreplay.platform.backend import set_variant
+set_variant("llvm_ad_spectral")
+from pathreplay.errors import PathreplayError
+from pathreplay.output.export import write_files
+from pathreplay.output.scene_folder import Source, exported, require_same
+
+def scene(texture):
+    shape = {"type": "ply", "filename": sys.argv[1], "bsdf": {"type": "diffuse", "reflectance": texture}}
+    return Source({"type": "scene", "m": shape}, {}, {}, {})
+
+painted = scene({"type": "mesh_attribute", "name": "vertex_color"})
+for key, count in (("m.vertex_rough", 24), ("m.vertex_positions", 72)):
+    found = exported(painted, {key: np.linspace(0.1, 0.9, count, dtype=np.float32)})
+    before = np.array(mi.traverse(found.scene)["m.vertex_color"])
+    folder = Path(sys.argv[2]) / key
+    folder.mkdir()
+    write_files(found, folder)
+    require_same(found.scene, folder)
+    assert list(found.files) == ["meshes/m.ply", "scene.xml"] and abs(before).max() > 1
+textured = scene({"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), 99, np.uint8))})
+for source, values in ((painted, {"m.vertex_color": np.full(72, 0.5)}), (textured, {})):
+    try:
+        exported(source, values)
+    except PathreplayError as error:
+        print(error)
+"""
+
+
+def test_spectra_of_colours_that_were_not_recovered_come_out_as_the_colours_of_the_file(tmp_path: Path) -> None:
+    mesh = mi.load_dict({"type": "cube"})
+    mesh.add_attribute("vertex_color", 3, np.linspace(0.1, 0.9, 72, dtype=np.float32))
+    mesh.add_attribute("vertex_rough", 1, np.full(24, 0.5, np.float32))
+    mesh.write_ply(str(tmp_path / "m.ply"))
+    command = [sys.executable, "-c", SPECTRAL, str(tmp_path / "m.ply"), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    colours, texture = done.stdout.splitlines()
+    assert colours.startswith("Attribute 'm.vertex_color' consists of smooth spectra")
+    assert colours.endswith("recover it in an rgb variant") and texture.endswith("give it as a file")
 
 
 # ------------------------------ A run ------------------------------

@@ -13,6 +13,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.output.nodes import Described, Node, Owner
 from pathreplay.platform import compat
+from pathreplay.platform.threads import spare_thread
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.parameters import get_array
 from pathreplay.scenes.spectra import coefficient_channels
@@ -124,20 +125,47 @@ class Placing:
         return vol_bounds(stream.raw_buffer())
 
     def _mesh(self, mesh: mi.Mesh, node: Node) -> None:
+        file = self._ply(mesh, node.props.id(), node)
         _remove(node.props, *_MADE_BY, "to_world", "flip_tex_coords")
         node.props.set_plugin_name("ply")
-        node.props["filename"] = self._ply(mesh, node.props.id())
+        node.props["filename"] = file
         self.owners.add(id(node))
 
-    def _ply(self, mesh: mi.Mesh, name: str) -> str:
-        """Add the PLY file of a mesh, unless it was added before, and return the file's name."""
+    def _ply(self, mesh: mi.Mesh, name: str, node: Node | None = None) -> str:
+        """Add the PLY file of a mesh, unless it was added before, and return the file's name.
+
+        ``node`` is the description of the mesh, or None for an existing object.
+        """
         if mesh.id() not in self._meshes:
-            stream = mi.MemoryStream()
+            stream, params = mi.MemoryStream(), mi.traverse(mesh)
+            spectra = {key: mi.Float(params[key]) for key in _spectra(mesh, params)}
+            params.update(self._colours(mesh, list(spectra), node))
             mesh.write_ply(stream)
+            params.update(spectra)
             file = f"meshes/{self.names.get(mesh.id(), name or f'mesh-{len(self._meshes)}')}.ply"
             self.files[file] = bytes(stream.raw_buffer())
             self._meshes[mesh.id()] = file
         return self._meshes[mesh.id()]
+
+    def _colours(self, mesh: mi.Mesh, keys: list[str], node: Node | None) -> dict[str, mi.Float]:
+        """Return the colours in the file of a mesh, for the attributes that spectral variants convert to spectra.
+
+        Raises PathreplayError if an attribute was recovered, or the mesh has no file.
+        """
+        if not keys:
+            return {}
+        changed = [key for key in keys if f"{mesh.id()}.{key}" in self.recovered]
+        if changed or node is None or "filename" not in node.props:
+            remedy = "recover it in an rgb variant" if changed else "give the mesh as a file"
+            raise PathreplayError(
+                f"Attribute '{mesh.id()}.{(changed or keys)[0]}' consists of smooth spectra in variant {mi.variant()}, "
+                f"which no file format of Mitsuba holds; {remedy}"
+            )
+        file = str(self.described.find_file(node.props.get("filename")))
+        with mi.variant_context("scalar_rgb"), spare_thread():
+            stored = mi.traverse(mi.load_dict({"type": node.props.plugin_name(), "filename": file}))
+            colours = {key: np.array(stored[key], np.float32) for key in keys}
+        return {key: mi.Float(colour) for key, colour in colours.items()}
 
     def _made_mesh(self, parent: Node, name: str, mesh: mi.Mesh) -> None:
         properties = mi.Properties("ply")
@@ -215,6 +243,16 @@ class Placing:
         node.props["filename"] = name
         self.owners.add(id(node))
         self.files[name] = data
+
+
+def _spectra(mesh: mi.Mesh, params: mi.SceneParameters) -> list[str]:
+    """Return the keys of the attributes of a mesh that Mitsuba has converted from colours to smooth spectra."""
+    counts = {"vertex": mesh.vertex_count(), "face": mesh.face_count()}
+    return [
+        key
+        for key in params.keys()
+        if mi.is_spectral and key.endswith("color") and len(params[key]) == 3 * counts.get(key.split("_")[0], 0)
+    ]
 
 
 def _remove(properties: mi.Properties, *names: str) -> None:
