@@ -67,6 +67,13 @@ def shots_of(model: str = "sparse/0", **more: Any) -> dict[str, Shot]:
     return read_capture(Capture(colmap=model, **more), Path(), picture_size)
 
 
+def test_a_model_that_is_a_link_has_the_images_beside_the_link(folder: Path) -> None:
+    (folder / "some" / "where").mkdir(parents=True)
+    (folder / "sparse" / "0").rename(folder / "some" / "where" / "else")
+    (folder / "sparse" / "0").symlink_to(folder / "some" / "where" / "else")
+    assert all(shot.image.is_relative_to(folder / "images") for shot in shots_of().values())
+
+
 def seen(shots: dict[str, Shot]) -> dict[str, np.ndarray]:
     """Where the cameras of the scene see the points: a row for each."""
     import mitsuba as mi

@@ -75,7 +75,7 @@ def photos_of_colmap(
         PathreplayError: a file cannot be read, or the model is inconsistent or not supported.
     """
     cameras, posed = _read(folder)
-    pictures = folder / ".." / ".." / "images" if images is None else images
+    pictures = _images_of(folder) if images is None else images
     photos = []
     for entry in sorted(posed, key=lambda entry: entry.name):
         where = f"{folder}: image {shown(entry.name)}"
@@ -98,6 +98,12 @@ def photos_of_colmap(
             )
         photos.append(Photo(where, entry.name, image, mask, lens, _place(where, entry)))
     return photos
+
+
+def _images_of(folder: Path) -> Path:
+    """Return ``../../images`` relative to a model. If the model is a symbolic link, try the link first."""
+    beside = folder.absolute().parent.parent / "images"
+    return beside if beside.is_dir() else folder / ".." / ".." / "images"
 
 
 def _read(folder: Path) -> tuple[dict[int, Lens], list[_Posed]]:
