@@ -17,6 +17,7 @@ import pytest
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.schema import Capture
 from pathreplay.inverse.dataset.capture import read_capture
+from pathreplay.inverse.dataset.transforms_json import photos_of_json
 from pathreplay.inverse.images.io import exr_bytes, picture_size, png_bytes, read_image
 from pathreplay.inverse.parameters.exposures import exposed
 from pathreplay.inverse.problem.problem import build_problem
@@ -68,9 +69,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "room.xml").write_text(SCENE)
     pictures = tmp_path / "capture" / "pictures"
     pictures.mkdir(parents=True)
-    for k in range(4):
-        grey = np.full((HEIGHT, WIDTH, 3), 0.8, np.float32)
-        (pictures / f"shot {k}.exr").write_bytes(exr_bytes(grey))
+    grey = np.full((HEIGHT, WIDTH, 3), 0.8, np.float32)
+    for name in (*(f"shot {k}" for k in range(4)), "shot_0"):
+        (pictures / f"{name}.exr").write_bytes(exr_bytes(grey))
     write(PLAIN)
     return tmp_path
 
@@ -103,6 +104,28 @@ def test_cameras_are_pinholes_as_the_file_says(lens: dict[str, float], scale: in
             X, Y, Z, _ = np.linalg.inv(frame["transform_matrix"]) @ [*point, 1]
             expected = lens.get("cx", WIDTH / 2) - fl * X / Z, lens.get("cy", HEIGHT / 2) + fl * Y / Z
             assert seen(camera, point) == pytest.approx(expected, abs=1e-3)
+
+
+WIDE, HIGH = 0.5 * WIDTH / math.tan(0.3), 0.5 * HEIGHT / math.tan(0.25)
+
+
+@pytest.mark.parametrize(
+    ("table", "frame", "focal"),
+    [
+        ({"camera_angle_x": 0.6, "camera_angle_y": 0.5}, {}, (WIDE, HIGH)),
+        ({"camera_angle_y": 0.5}, {}, (HIGH, HIGH)),
+        ({"fl_y": 9.0}, {}, (9.0, 9.0)),
+        ({"camera_angle_x": 0.6, "fl_y": 9.0}, {}, (WIDE, 9.0)),
+        ({"fl_x": 8.0, "fl_y": 9.0, "camera_angle_x": 0.6, "camera_angle_y": 0.5}, {}, (8.0, 9.0)),
+        ({"camera_angle_x": 0.9, "camera_angle_y": 0.5, "fl_y": 9.0}, {"camera_angle_x": 0.6}, (WIDE, WIDE)),
+    ],
+)
+def test_focal_lengths_of_both_axes_are_read(
+    table: dict[str, float], frame: dict[str, float], focal: tuple[float, float]
+) -> None:
+    write({**table, "frames": [{**FRAMES[0], **frame}]})
+    (photo,) = photos_of_json(Path("capture/transforms.json"), picture_size)
+    assert (photo.lens.fx, photo.lens.fy) == pytest.approx(focal)
 
 
 def test_a_job_learns_from_a_capture() -> None:
@@ -261,6 +284,10 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "sheared": (with_frame(transform_matrix=np.diag([1, 2, 1, 1]).tolist()), "is not a rigid motion"),
     "a mirror": (with_frame(transform_matrix=np.diag([-1, 1, 1, 1]).tolist()), "is not a rigid motion"),
     "not finite": (json.dumps(PLAIN).replace("0.6", "NaN"), "is not a valid transforms.json"),
+    "two names": (
+        {**PLAIN, "frames": [FRAMES[0], {**FRAMES[0], "file_path": "./pictures/shot_0"}]},
+        "The images './pictures/shot 0' and './pictures/shot_0' of the capture would both be called 'shot_0'",
+    ),
     "twice": ({**PLAIN, "frames": [FRAMES[0], FRAMES[0]]}, "would both be called 'pictures_shot_0'"),
 }
 

@@ -27,6 +27,7 @@ STRAIGHT = 1e-3
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 Row = Annotated[list[Annotated[FiniteFloat, Field(gt=-1e9, lt=1e9)]], Field(min_length=4, max_length=4)]
+Angle = Annotated[FiniteFloat, Field(gt=1e-3, lt=math.pi - 1e-3)]
 Length = Annotated[FiniteFloat, Field(gt=1e-3, lt=1e6)]
 Bounded = Annotated[FiniteFloat, Field(gt=-1e6, lt=1e6)]
 
@@ -37,7 +38,8 @@ class _Intrinsics(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     camera_model: str | None = None
-    camera_angle_x: Annotated[FiniteFloat, Field(gt=1e-3, lt=math.pi - 1e-3)] | None = None
+    camera_angle_x: Angle | None = None
+    camera_angle_y: Angle | None = None
     fl_x: Length | None = None
     fl_y: Length | None = None
     cx: Bounded | None = None
@@ -85,9 +87,10 @@ def photos_of_json(
             continue
         image = _picture(frame.file_path, path)
         own = frame.model_dump(include=fields, exclude_unset=True)
-        table = transforms.model_dump(include=fields) | own
+        table = transforms.model_dump(include=fields)
         if own.get("camera_angle_x") is not None and own.get("fl_x") is None:
-            table |= {"fl_x": None, "fl_y": None}
+            table |= {"fl_x": None, "fl_y": None, "camera_angle_y": None}
+        table |= own
         where = f"{path}: frame {shown(frame.file_path)}"
         mask = None if frame.mask_path is None else _picture(frame.mask_path, path)
         lens = _lens(where, table, size_of(image))
@@ -159,14 +162,17 @@ def _lens(where: str, table: Json, size: tuple[int, int]) -> Lens:
         raise PathreplayError(
             f"{where} is {w:g} x {h:g} in the capture, but its file is {size[0]} x {size[1]}; correct w and h"
         )
-    if table["fl_x"] is not None:
-        fx = table["fl_x"]
-        fy = fx if table["fl_y"] is None else table["fl_y"]
-    elif table["camera_angle_x"] is not None:
-        fx = fy = w / (2 * math.tan(table["camera_angle_x"] / 2))
-    else:
+    fx, fy = _focal(table, "x", w), _focal(table, "y", h)
+    fx, fy = fx or fy, fy or fx
+    if fx is None or fy is None:
         raise PathreplayError(f"{where} has neither fl_x nor camera_angle_x; add one of them")
     cx, cy = (half / 2 if table[key] is None else table[key] for key, half in (("cx", w), ("cy", h)))
     ks = tuple(table[f"k{i}"] for i in (1, 2, 3, 4))
     radial = (*ks, 0.0, 0.0) if fisheye else (*ks[:3], 0.0, 0.0, 0.0)
     return Lens(w, h, fx, fy, cx, cy, radial, (0.0, 0.0) if fisheye else (table["p1"], table["p2"]), fisheye)
+
+
+def _focal(table: Json, axis: str, size: float) -> float | None:
+    """Return the focal length along an axis in pixels, or None if neither it nor the angle of view is given."""
+    focal, angle = table[f"fl_{axis}"], table[f"camera_angle_{axis}"]
+    return size / (2 * math.tan(angle / 2)) if focal is None and angle is not None else focal
