@@ -17,7 +17,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.errors import PathreplayError
+from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.target_options import Capture
 from pathreplay.inverse.dataset.colmap import photos_of_colmap
 from pathreplay.inverse.dataset.photos import Photo
@@ -123,7 +123,11 @@ def view_names(files: list[str]) -> list[str]:
     words = [re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-") or "view" for name in names]
     if len(set(words)) < len(words):
         twice = next(word for word in words if words.count(word) > 1)
-        raise PathreplayError(f"The capture has two images that would both be called '{twice}'; remove or rename one")
+        first, other = [file for file, word in zip(files, words, strict=True) if word == twice][:2]
+        raise PathreplayError(
+            f"The images {shown(first)} and {shown(other)} of the capture would both be called '{twice}'; remove or "
+            "rename one"
+        )
     return list(file_names(words).values())
 
 
