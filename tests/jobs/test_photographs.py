@@ -190,6 +190,7 @@ def test_what_is_not_there_is_told(tmp_path: Path) -> None:
     for options, told in [
         ({"minutes": -1.0}, "minutes is -1.0"),
         ({"test_every": 1}, "test_every is 1"),
+        ({"test_every": 2.5}, "test_every is 2.5; give a whole number"),
         ({"width": 4}, "width is 4"),
     ]:
         with pytest.raises(PathreplayError, match=told):

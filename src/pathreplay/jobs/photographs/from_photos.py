@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 
 import mitsuba as mi
@@ -129,7 +130,7 @@ def _stages_note(stages: Sequence[StagePlan], width: int, height: int) -> str:
 def _require_options(minutes: float, test_every: int, width: int | None) -> None:
     if not 0 < minutes < 1e5:
         raise PathreplayError(f"minutes is {shown(minutes)}; give a positive number of minutes")
-    if test_every < 2:
+    if not isinstance(test_every, Integral) or test_every < 2:
         raise PathreplayError(f"test_every is {shown(test_every)}; give a whole number of at least 2")
     if width is not None and not 16 <= width <= 8192:
         raise PathreplayError(f"width is {shown(width)}; give the width of the compared images, 16 to 8192 pixels")
