@@ -44,7 +44,7 @@ class SeenLights:
             light, _ = scene.sample_emitter_direction(origin, sampler.next_2d(), False)
             position, inside = _position_of(sensor, light.p)
             hit = scene.ray_intersect_preliminary(mi.Ray3f(sample.at(position).ray(sensor)[0]), coherent=False)
-            active = (light.pdf > 0) & inside
+            active = (light.pdf > 0) & ~light.delta & inside
             flags, glows = light.emitter.flags(), hit.shape.emitter() != None  # noqa: E711
             bright = light.pdf * len(scene.emitters()) > BRIGHT
             sky = active & mi.has_flag(flags, mi.EmitterFlags.Infinite) & bright & ~hit.is_valid()
@@ -58,10 +58,11 @@ class SeenLights:
 
 
 def _position_of(sensor: mi.Sensor, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
-    """Return the film position at which the camera would see a point, and whether it lies on the film."""
-    if (
-        sensor.class_name() == ORTHOGRAPHIC
-    ):  # Mitsuba does not project points, but positions are linear functions of them
+    """Return the film position at which the camera would see a point, and whether it lies on the film.
+
+    Mitsuba's orthographic camera does not project points, but its film positions are linear functions of points.
+    """
+    if sensor.class_name() == ORTHOGRAPHIC:
         middle = probes_of(sensor).at(mi.Point2f(0.5))
         ray = middle.ray(sensor)[0]
         t = dr.dot(p - ray.o, ray.d)
