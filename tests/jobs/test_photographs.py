@@ -7,6 +7,7 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mitsuba as mi
@@ -21,10 +22,10 @@ from pathreplay.inverse.dataset.photos import Photo
 from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.inverse.images.io import exr_bytes, png_bytes
 from pathreplay.jobs.photographs.pictures import BLOCK, frames_of, prepare
-from pathreplay.jobs.photographs.plan import LEAST, Speed, plan_stages
+from pathreplay.jobs.photographs.plan import LEAST, PASSES, TRACED, Speed, plan_stages
 from pathreplay.jobs.photographs.reading import find_photos
 from pathreplay.jobs.photographs.region import find_region, sky_rows
-from pathreplay.jobs.photographs.timing import measure, measure_poses
+from pathreplay.jobs.photographs.timing import TIMED_SPP, measure_poses
 from pathreplay.output.surface_scene import export_surface
 
 VIEWS, SIZE, FOV = 10, 32, 0.75
@@ -283,11 +284,16 @@ def test_stages_that_refine_poses_are_planned_with_their_own_speed() -> None:
     assert [stage.iterations for stage in plan_stages(speed, 1, 40, 160, 280, posed)] == [LEAST]
 
 
-def test_passes_with_poses_are_measured(capture: Path, tmp_path: Path) -> None:
+def test_passes_with_poses_are_measured(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planned is what was measured: a clock says 7 s of the first pass, at least 1 s of small and 3 s of large ones."""
     written = pathreplay.from_photos(capture, tmp_path / "job", minutes=0.01)
     frames = frames_of(find_photos(capture).photos[:3], 16)
-    plain, posed = (way(written.folder / "scene.xml", frames, 1.0) for way in (measure, measure_poses))
-    assert posed.tracing > 2 * plain.tracing
+    times = iter([time for seconds in (7, 2, 1, 2, 4, 3, 3) for time in (0.0, float(seconds))])
+    monkeypatch.setattr("pathreplay.jobs.photographs.timing.time", SimpleNamespace(perf_counter=times.__next__))
+    posed = measure_poses(written.folder / "scene.xml", frames, 1.0)
+    samples = frames[1].width * frames[1].height * TIMED_SPP
+    assert PASSES * samples / posed.samples == pytest.approx(3 - 1)
+    assert (TRACED * posed.tracing, TRACED * posed.compiling) == pytest.approx((1, 7 - 1))
 
 
 def test_a_fast_machine_renders_more_samples_in_about_the_same_number_of_iterations() -> None:

@@ -14,7 +14,7 @@ from pathreplay.inverse.dataset.capture import pinhole_camera
 from pathreplay.inverse.problem.problem import notes_on_edges
 from pathreplay.jobs.photographs.mesh import COLOUR
 from pathreplay.jobs.photographs.pictures import Frame
-from pathreplay.jobs.photographs.plan import PASSES, Speed
+from pathreplay.jobs.photographs.plan import PASSES, TRACED, Speed
 from pathreplay.scenes.loading import load_scene, load_scene_with
 
 TIMED_SPP = 4
@@ -39,9 +39,10 @@ def measure(scene: Path, frames: Sequence[Frame], near: float) -> Speed:
 
 
 def measure_poses(scene: Path, frames: Sequence[Frame], near: float) -> Speed:
-    """Measure a pass with the gradient of all poses, and return the speed in images, as `plan_stages` expects it.
+    """Measure a pass with the gradient of all poses, and return the speed of images for which `plan_stages` plans it.
 
-    The pass takes about as long per sample as an iteration, which `plan_stages` counts as `PASSES` images.
+    `plan_stages` multiplies the seconds of an image by `PASSES` per sample, and by `TRACED` for tracing and compiling.
+    The measured seconds are divided by these factors, so that the plan contains the measured seconds.
     """
     frame = frames[len(frames) // 2]
     cameras = {each.name: pinhole_camera(each.lens, each.place, (each.width, each.height), near) for each in frames}
@@ -67,7 +68,7 @@ def measure_poses(scene: Path, frames: Sequence[Frame], near: float) -> Speed:
         return time.perf_counter() - begin
 
     speed = _speed(seconds, frame)
-    return Speed(PASSES * speed.samples, speed.tracing, speed.compiling)
+    return Speed(PASSES * speed.samples, speed.tracing / TRACED, speed.compiling / TRACED)
 
 
 def _speed(seconds: Callable[[bool, int, int], float], frame: Frame) -> Speed:
