@@ -118,11 +118,15 @@ WIDE, HIGH = 0.5 * WIDTH / math.tan(0.3), 0.5 * HEIGHT / math.tan(0.25)
         ({"camera_angle_x": 0.6, "fl_y": 9.0}, {}, (WIDE, 9.0)),
         ({"fl_x": 8.0, "fl_y": 9.0, "camera_angle_x": 0.6, "camera_angle_y": 0.5}, {}, (8.0, 9.0)),
         ({"camera_angle_x": 0.9, "camera_angle_y": 0.5, "fl_y": 9.0}, {"camera_angle_x": 0.6}, (WIDE, WIDE)),
+        ({"fl_x": 8.0, "fl_y": 9.0}, {"camera_angle_y": 0.5}, (HIGH, HIGH)),
+        ({"camera_angle_x": 0.6, "camera_angle_y": 0.5}, {"fl_x": 20.0}, (20.0, 20.0)),
+        ({"fl_x": 8.0, "fl_y": 9.0}, {"camera_angle_x": 0.6, "camera_angle_y": 0.5}, (WIDE, HIGH)),
     ],
 )
 def test_focal_lengths_of_both_axes_are_read(
     table: dict[str, float], frame: dict[str, float], focal: tuple[float, float]
 ) -> None:
+    """Those of a frame replace all of the file's, so that no frame gets oblong pixels from half of them."""
     write({**table, "frames": [{**FRAMES[0], **frame}]})
     (photo,) = photos_of_json(Path("capture/transforms.json"), picture_size)
     assert (photo.lens.fx, photo.lens.fy) == pytest.approx(focal)
@@ -271,7 +275,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "no JSON": ("{", "is not a valid transforms.json"),
     "a list": ([1], "is not a valid transforms.json"),
     "no frames": ({"frames": []}, "'frames'"),
-    "no lens": ({"frames": FRAMES}, "neither fl_x nor camera_angle_x"),
+    "no lens": ({"frames": FRAMES}, "has none of fl_x, fl_y, camera_angle_x and camera_angle_y"),
     "another lens": ({**PLAIN, "camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR'; undistort"),
     "k4 of whom": ({**PLAIN, "k1": 0.1, "k4": -0.01}, "has k4 = -0.01, which OpenCV and Nerfstudio define differently"),
     "bent without end": ({**PLAIN, "k1": 1e300}, "is not a valid transforms.json ('k1'"),

@@ -24,6 +24,8 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".exr")
 """Suffixes to try for images that are named without a suffix, as in the original NeRF scenes."""
 STRAIGHT = 1e-3
 """Tolerance on the orthonormality of the axes of a camera."""
+FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
+"""Fields that give the focal lengths. A frame that has one of them uses none of the file."""
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 Row = Annotated[list[Annotated[FiniteFloat, Field(gt=-1e9, lt=1e9)]], Field(min_length=4, max_length=4)]
@@ -88,8 +90,8 @@ def photos_of_json(
         image = _picture(frame.file_path, path)
         own = frame.model_dump(include=fields, exclude_unset=True)
         table = transforms.model_dump(include=fields)
-        if own.get("camera_angle_x") is not None and own.get("fl_x") is None:
-            table |= {"fl_x": None, "fl_y": None, "camera_angle_y": None}
+        if any(own.get(key) is not None for key in FOCAL):
+            table |= dict.fromkeys(FOCAL)
         table |= own
         where = f"{path}: frame {shown(frame.file_path)}"
         mask = None if frame.mask_path is None else _picture(frame.mask_path, path)
@@ -165,7 +167,7 @@ def _lens(where: str, table: Json, size: tuple[int, int]) -> Lens:
     fx, fy = _focal(table, "x", w), _focal(table, "y", h)
     fx, fy = fx or fy, fy or fx
     if fx is None or fy is None:
-        raise PathreplayError(f"{where} has neither fl_x nor camera_angle_x; add one of them")
+        raise PathreplayError(f"{where} has none of {', '.join(FOCAL[:-1])} and {FOCAL[-1]}; add one of them")
     cx, cy = (half / 2 if table[key] is None else table[key] for key, half in (("cx", w), ("cy", h)))
     ks = tuple(table[f"k{i}"] for i in (1, 2, 3, 4))
     radial = (*ks, 0.0, 0.0) if fisheye else (*ks[:3], 0.0, 0.0, 0.0)
