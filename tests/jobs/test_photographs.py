@@ -165,7 +165,7 @@ def test_ignored_metadata_of_photos_is_told(capture: Path, tmp_path: Path) -> No
     [
         (np.diag([2.0, 2, 2, 1]), r"its axes have the lengths 2, 2, 2\)"),
         (np.array([[1, 0.6, 0, 0], [0, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), r"its axes are not at right angles"),
-        (np.diag([-1.0, 1, 1, 1]), r"it mirrors"),
+        (np.diag([-1.0, 1, 1, 1]), r"it contains a reflection"),
         (np.diag([1.0, 1, 1, 2]), r"its last row is \[0\.0, 0\.0, 0\.0, 2\.0\]"),
     ],
 )

@@ -103,20 +103,23 @@ def photos_of_json(
 def _place(where: str, rows: list[list[float]]) -> np.ndarray:
     """Return the camera-to-world matrix. Raises PathreplayError if it is not a rigid motion."""
     place = np.array(rows)
-    products = place[:3, :3].T @ place[:3, :3]
-    lengths = np.sqrt(products.diagonal())
-    wrong = ""
-    if rows[3] != [0, 0, 0, 1]:
-        wrong = f"its last row is {rows[3]}"
-    elif np.abs(lengths**2 - 1).max() > STRAIGHT:
-        wrong = f"its axes have the lengths {', '.join(f'{length:.4g}' for length in lengths)}"
-    elif np.abs(products - np.eye(3)).max() > STRAIGHT:
-        wrong = "its axes are not at right angles"
-    elif np.linalg.det(place[:3, :3]) < 0:
-        wrong = "it mirrors"
-    if wrong:
-        raise PathreplayError(f"{where} has a transform_matrix that is not a rigid motion ({wrong}); correct it")
+    if (reason := _why_not_rigid(place)) is not None:
+        raise PathreplayError(f"{where} has a transform_matrix that is not a rigid motion ({reason}); correct it")
     return place
+
+
+def _why_not_rigid(place: np.ndarray) -> str | None:
+    """Return why a matrix is not a rigid motion, or None if it is one."""
+    axes, last = place[:3, :3], place[3].tolist()
+    products = axes.T @ axes
+    lengths = np.sqrt(products.diagonal())
+    if last != [0, 0, 0, 1]:
+        return f"its last row is {last}"
+    if np.abs(lengths**2 - 1).max() > STRAIGHT:
+        return f"its axes have the lengths {', '.join(f'{length:.4g}' for length in lengths)}"
+    if np.abs(products - np.eye(3)).max() > STRAIGHT:
+        return "its axes are not at right angles"
+    return "it contains a reflection" if np.linalg.det(axes) < 0 else None
 
 
 def _read(path: Path) -> _Transforms:
