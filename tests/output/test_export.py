@@ -419,6 +419,16 @@ for source, values in ((painted, {"m.vertex_color": np.full(72, 0.5)}), (texture
         exported(source, values)
     except PathreplayError as error:
         print(error)
+
+meshes = []
+def full_disk(mesh, stream):
+    meshes.append(mesh)
+    raise OSError("no space left")
+mi.Mesh.write_ply = full_disk
+try:
+    exported(painted, {"m.vertex_rough": np.full(24, 0.5)})
+except OSError:
+    assert (np.array(mi.traverse(meshes[0])["vertex_color"]) == before).all()
 """
 
 

@@ -140,8 +140,10 @@ class Placing:
             stream, params = mi.MemoryStream(), mi.traverse(mesh)
             spectra = {key: mi.Float(params[key]) for key in _spectra(mesh, params)}
             params.update(self._colours(mesh, list(spectra), node))
-            mesh.write_ply(stream)
-            params.update(spectra)
+            try:
+                mesh.write_ply(stream)
+            finally:
+                params.update(spectra)
             file = f"meshes/{self.names.get(mesh.id(), name or f'mesh-{len(self._meshes)}')}.ply"
             self.files[file] = bytes(stream.raw_buffer())
             self._meshes[mesh.id()] = file
@@ -161,9 +163,11 @@ class Placing:
                 f"Attribute '{mesh.id()}.{(changed or keys)[0]}' consists of smooth spectra in variant {mi.variant()}, "
                 f"which no file format of Mitsuba holds; {remedy}"
             )
-        file = str(self.described.find_file(node.props.get("filename")))
+        source = {"type": node.props.plugin_name(), "filename": str(self.described.find_file(node.props["filename"]))}
+        if "shape_index" in node.props:
+            source["shape_index"] = node.props["shape_index"]
         with mi.variant_context("scalar_rgb"), spare_thread():
-            stored = mi.traverse(mi.load_dict({"type": node.props.plugin_name(), "filename": file}))
+            stored = mi.traverse(mi.load_dict(source))
             colours = {key: np.array(stored[key], np.float32) for key in keys}
         return {key: mi.Float(colour) for key, colour in colours.items()}
 
