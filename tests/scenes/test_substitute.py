@@ -94,10 +94,10 @@ def test_after_a_scene_that_cannot_be_loaded_another_is_rendered():
     description = mi.cornell_box()
     description["sensor"]["film"] |= {"width": 8, "height": 8}
     broken = {**description, "back": {"type": "rectangle", "bsdf": {"type": "diffuse", "nothing": 1.0}}}
-    with pytest.raises(RuntimeError, match="unreferenced property") as told:
+    with pytest.raises(RuntimeError, match="unreferenced property") as told:  # keeps the traceback until `del`
         load_dict_with(broken, {})
     assert np.array(mi.render(mi.load_dict(description), spp=16)).mean() > 0.1
-    assert told.value.__traceback__ is not None
+    del told
 
 
 def test_what_mitsuba_would_die_of_or_wait_for_is_told(tmp_path):
