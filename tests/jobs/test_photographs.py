@@ -148,16 +148,17 @@ def test_frames_without_an_image_are_left_out(capture: Path, tmp_path: Path) -> 
         find_photos(tmp_path)
 
 
-def test_ignored_metadata_of_photos_is_told(capture: Path, tmp_path: Path) -> None:
-    """A photo that a phone has marked as turned by 90 degrees."""
+@pytest.mark.parametrize(("count", "others"), [(1, ""), (2, " (and 1 other)"), (3, " (and 2 others)")])
+def test_ignored_metadata_of_photos_is_told(count: int, others: str, capture: Path, tmp_path: Path) -> None:
+    """Photos that a phone has marked as turned by 90 degrees."""
     shutil.copytree(capture, tmp_path / "turned")
     turned = PIL.Image.Exif()
     turned[274] = 6
-    for name in ("1.png", "2.png"):
+    for name in ("1.png", "2.png", "3.png")[:count]:
         with PIL.Image.open(capture / name) as picture:
             picture.save(tmp_path / "turned" / name, exif=turned)
     notes = pathreplay.from_photos(tmp_path / "turned", tmp_path / "job", minutes=0.01).notes
-    assert any(note.startswith("photo '1.png' (and 1 others) has an Exif orientation: it is ignored") for note in notes)
+    assert any(note.startswith(f"photo '1.png'{others} has an Exif orientation: it is ignored") for note in notes)
 
 
 @pytest.mark.parametrize(

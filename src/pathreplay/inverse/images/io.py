@@ -182,10 +182,11 @@ def notes_on_metadata(what: str, files: Mapping[str, Path]) -> list[str]:
     for name, path in files.items():
         for oddity in _oddities(path):
             odd.setdefault(oddity, []).append(name)
-    return [
-        f"{what} '{names[0]}'{f' (and {len(names) - 1} others)' if len(names) > 1 else ''} {oddity}"
-        for oddity, names in odd.items()
-    ]
+    notes = []
+    for oddity, (first, *others) in odd.items():
+        more = f" (and {len(others)} other{'s' if len(others) > 1 else ''})" if others else ""
+        notes.append(f"{what} '{first}'{more} {oddity}")
+    return notes
 
 
 def _oddities(path: Path) -> list[str]:
