@@ -176,7 +176,7 @@ def _numbers(value: Any) -> np.ndarray:
 def _loaded(source: Source, values: Arrays) -> tuple[mi.Scene, tuple[str, ...]]:
     """Load the scene, and return it with the names of the image files whose texels are stored as floats.
 
-    These are the 8-bit textures that have a value, whose texels runs store as floats, too.
+    These are the 8-bit textures with a recovered value; runs store their texels as floats.
     """
     scene = source.load()
     floats = coarse_pictures(traversed(scene), values)

@@ -290,9 +290,9 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "not finite": (json.dumps(PLAIN).replace("0.6", "NaN"), "is not a valid transforms.json"),
     "two names": (
         {**PLAIN, "frames": [FRAMES[0], {**FRAMES[0], "file_path": "./pictures/shot_0"}]},
-        "The images './pictures/shot 0' and './pictures/shot_0' of the capture would both be called 'shot_0'",
+        "The images './pictures/shot 0' and './pictures/shot_0' of the capture would both get the name 'shot_0'",
     ),
-    "twice": ({**PLAIN, "frames": [FRAMES[0], FRAMES[0]]}, "would both be called 'pictures_shot_0'"),
+    "twice": ({**PLAIN, "frames": [FRAMES[0], FRAMES[0]]}, "would both get the name 'pictures_shot_0'"),
 }
 
 

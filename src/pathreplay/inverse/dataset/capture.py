@@ -125,7 +125,7 @@ def view_names(files: list[str]) -> list[str]:
         twice = next(word for word in words if words.count(word) > 1)
         first, other = [file for file, word in zip(files, words, strict=True) if word == twice][:2]
         raise PathreplayError(
-            f"The images {shown(first)} and {shown(other)} of the capture would both be called '{twice}'; remove or "
+            f"The images {shown(first)} and {shown(other)} of the capture would both get the name '{twice}'; remove or "
             "rename one"
         )
     return list(file_names(words).values())
