@@ -51,6 +51,21 @@ def test_tangents_that_jump_between_triangles_are_edges(boundary: str) -> None:
     assert abs(expected) > 1e-3 and np.mean(found) == pytest.approx(expected, rel=0.05)
 
 
+def test_tangents_that_turn_slowly_are_no_edges() -> None:
+    """A normal map on a fine cylinder: the search would find all sides of its triangles, and little else."""
+    mi.set_variant(VARIANT)
+    n = 400
+    angle, height = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 2, n), np.linspace(0, 1, 3), indexing="ij"))
+    i = np.array([3 * k + j for k in range(n - 1) for j in range(2)])
+    faces = np.concatenate([np.stack([i, i + 3, i + 4], 1), np.stack([i, i + 4, i + 1], 1)])
+    relief = {"type": "bumpmap", "arbitrary": {"type": "checkerboard"}, "bsdf": {"type": "diffuse"}}
+    positions = np.stack([np.cos(angle), np.sin(angle), height], 1)
+    fine = mesh(positions, faces, np.stack([angle, height], 1), relief)
+    scene = mi.load_dict({"type": "scene", "sheet": fine, "sun": SUN}, optimize=False)
+    traits = facts_of(scene).traits()
+    assert not traits.brushed_meshes and not traits.coarse_meshes
+
+
 def test_a_flat_mesh_that_becomes_bumpy_is_coarse() -> None:
     mi.set_variant(VARIANT)
     n = 10

@@ -17,8 +17,8 @@ import pathreplay
 from pathreplay.inverse.parameters.pose import make_pose
 from pathreplay.output.export import obj_bytes
 from pathreplay.platform import compat
+from pathreplay.transport.facts.facets import is_coarse
 from pathreplay.transport.facts.smoothing_groups import mesh_smoothing_groups
-from pathreplay.transport.facts.traits import is_coarse
 
 SOURCE = Path(pathreplay.__file__).parent
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)

@@ -19,7 +19,7 @@ from pathreplay.boundary.hard_shadows import ShadowTest, sample_light
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
-from pathreplay.transport.motion import may_move, may_turn
+from pathreplay.transport.motion import is_one_of, may_move, may_turn
 from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import mixed, place_met, shape_met, turned_away
 from pathreplay.transport.start import CameraStart
@@ -107,8 +107,11 @@ def _probe_vertex(trace: TraceConfig, path: PathState, key: mi.UInt32, active: m
     if not (traits.coarse_meshes or traits.brushed_meshes):
         return probe
     triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)
-    if traits.brushed_meshes:  # the tangents of anisotropic lobes jump at every edge between triangles
-        return replace(probe, signature=mixed(probe.signature, triangle))
+    if traits.brushed_meshes:
+        jumps = dr.select(is_one_of(traits.brushed_meshes, at.hit), triangle, 0)
+        probe = replace(probe, signature=mixed(probe.signature, jumps))
+    if not traits.coarse_meshes:
+        return probe
     light, lobe = _scattered(trace, path, steady(si, at.ray, active), key, active)
     return replace(probe, triangle=triangle, light=light, lobe=lobe)
 

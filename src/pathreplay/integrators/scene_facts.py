@@ -13,6 +13,7 @@ from pathreplay.integrators.lifetimes import SCENES, is_recording
 from pathreplay.platform import compat
 from pathreplay.transport.facts.absent_lobes import AbsentLobes, ranges_of
 from pathreplay.transport.facts.dark_texels import DarkTexels
+from pathreplay.transport.facts.facets import Facets
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of, plain_numbers, with_gradients
 from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
@@ -25,9 +26,7 @@ from pathreplay.transport.facts.traits import (
     Traits,
     blend_lengths,
     emitter_bounds,
-    facets_of,
     fixed_traits,
-    is_smooth_mesh,
     is_veil,
     scene_bounds,
     smoothing_groups_of,
@@ -53,8 +52,7 @@ class SceneFacts:
             if is_mesh(shape) and shape.face_count() == 0:
                 raise PathreplayError(f"pathreplay: mesh '{shape.id()}' has no faces, and cannot be traced: remove it")
         self._boxes = [shape.bbox() for shape in self._shapes]
-        self._smooth = [shape for shape in self._shapes if is_smooth_mesh(shape)]
-        self._vertices = list(map(compat.positions_array, self._smooth))
+        self._facets = Facets(self._shapes)
         self._faces = _faces(self._shapes)
         self._placed = scene.shapes()
         self._lights = scene.emitters()
@@ -121,20 +119,15 @@ class SceneFacts:
         These are the parameters that Mitsuba stores as plain numbers, such as the ``eta`` of `dielectric`, the lobes of
         BSDFs, whether meshes are coarse, and the values of `GridMedium.constants`.
         """
-        self._update_facets()
-        facets = self._traits.coarse_meshes, self._traits.brushed_meshes
+        self._facets.update()
         of_media = tuple(medium.constants for medium in self._media if hasattr(medium, "constants"))
-        return (*facets, *of_media, *map(plain_numbers, self._with_constants), *(bsdf.flags() for bsdf in self._bsdfs))
-
-    def _update_facets(self) -> None:
-        """Update `Traits.coarse_meshes` and `Traits.brushed_meshes` if vertices changed, except in a recording."""
-        if is_recording():
-            return
-        vertices = list(map(compat.positions_array, self._smooth))
-        if [array.index for array in vertices] != [array.index for array in self._vertices]:
-            self._vertices = vertices
-            coarse, brushed = facets_of(self._smooth)
-            self._traits = replace(self._traits, coarse_meshes=coarse, brushed_meshes=brushed)
+        return (
+            self._facets.coarse,
+            self._facets.brushed,
+            *of_media,
+            *map(plain_numbers, self._with_constants),
+            *(bsdf.flags() for bsdf in self._bsdfs),
+        )
 
     def branches(self) -> bool:
         """Return the current value of `Media.branches`."""
@@ -145,10 +138,13 @@ class SceneFacts:
 
         The traits contain ``tables`` or, by default, the current lookup tables.
         """
-        self._update_facets()
+        if not is_recording():
+            self._facets.update()
         return replace(
             self._traits,
             tables=self.tables() if tables is None else tables,
+            coarse_meshes=self._facets.coarse,
+            brushed_meshes=tuple(self._facets.meshes[i] for i in self._facets.brushed),
             lights_deform=any(with_gradients(mesh, *compat.POSITIONS) for mesh in self._mesh_emitters),
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
             opacity_moves=any(with_gradients(mask, "opacity", "weight") for mask in self._masks if is_veil(mask)),

@@ -22,6 +22,8 @@ from pathreplay.transport.vertex import Arrival, SampledContinuation, TraceConfi
 
 FEW = 8
 """Largest number of moving shapes that are tracked individually. If more shapes move, every shape counts as moving."""
+SEVERAL = 64
+"""Largest number of moving shapes for which `shapes_with_gradients` returns a result."""
 COPIES = frozenset({"Instance", "ShapeGroup"})
 
 
@@ -49,21 +51,31 @@ def moving_shapes(
     return moving, tuple(shape for shape in found if shape not in moving)
 
 
+def shapes_with_gradients(scene: mi.Scene) -> tuple[mi.Shape, ...] | None:
+    """Return the shapes that have gradients themselves; None if there are instances, or more than `SEVERAL` shapes."""
+    shapes = scene.shapes()
+    if any(shape.class_name() in COPIES for shape in shapes):
+        return None
+    found = tuple(shape for shape in shapes if with_gradients(shape, "to_world", "control_points", *compat.POSITIONS))
+    return found if len(found) <= SEVERAL else None
+
+
 def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
     """Return the lanes in which a parameter may move the surface that was hit.
 
     If `moving_shapes` returned None, the result is True in all lanes, including misses.
     """
     moving = trace.traits.moving
-    return mi.Bool(True) if moving is None else _is_one_of(moving, hit)
+    return mi.Bool(True) if moving is None else is_one_of(moving, hit)
 
 
 def may_turn(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
     """Return the lanes in which the surface that was hit does not move, but rays that continue from it may move."""
-    return _is_one_of(trace.traits.turning, hit)
+    return is_one_of(trace.traits.turning, hit)
 
 
-def _is_one_of(shapes: tuple[mi.Shape, ...], hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+def is_one_of(shapes: tuple[mi.Shape, ...], hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+    """Return the lanes in which one of the shapes was hit."""
     found = mi.Bool(False)
     for shape in shapes:
         found |= hit.shape == mi.ShapePtr(shape)

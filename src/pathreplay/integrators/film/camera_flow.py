@@ -31,6 +31,9 @@ import mitsuba as mi
 from pathreplay.integrators.film.grid import NODES, Cell, NodeSums, interpolated
 from pathreplay.integrators.film.lights import SeenLights
 from pathreplay.integrators.film.sample import (
+    CAMERAS,
+    ORTHOGRAPHIC,
+    PINHOLE,
     STEP,
     RayDerivatives,
     Sample,
@@ -41,14 +44,9 @@ from pathreplay.integrators.film.sample import (
 )
 from pathreplay.transport.facts.nodes import with_gradients
 
-PINHOLE = "PerspectiveCamera"
-CAMERAS = frozenset({PINHOLE, "ThinLensCamera", "OrthographicCamera"})
-"""Classes of sensors whose rays are smooth functions of the film position, also outside the border of the film."""
 ONLY_POSITIONS = "x_fov", "principal_point_offset_x", "principal_point_offset_y"
 """Camera parameters that only move rays to other film positions. The film flow contains all motion of such rays."""
 OTHERS = "to_world", "focus_distance", "aperture_radius"
-FARTHEST = 1e-6
-"""Closeness near bright parts of the sky, relative to that of surfaces."""
 K_0 = 1e3
 """Weight of the mean closeness of all visible surfaces, at each node."""
 
@@ -93,6 +91,7 @@ class CameraFlow:
 
     sensor: mi.Sensor
     closeness: mi.Float  # at the nodes of a grid (see `grid`), the reciprocal of the distance r (see the module)
+    mean_closeness: mi.Float  # the mean over the nodes, which is positive
     leaves_rest: bool  # whether rays have motion that the flow does not contain
     is_all: bool
     samples: int = 2
@@ -107,7 +106,10 @@ class CameraFlow:
         alone = not (rest or others or with_gradients(sensor, "medium"))
         # Without a rest, the flow does not depend on the distance.
         closeness = _closeness(scene, sensor) if rest else dr.full(mi.Float, 1, NODES * NODES)
-        return CameraFlow(sensor, closeness, rest, alone)
+        mean = dr.mean(closeness)
+        mean = dr.select(mean > 0, mean, 1)
+        dr.eval(mean)
+        return CameraFlow(sensor, closeness, mean, rest, alone)
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         ray, weight = sample.ray(self.sensor)
@@ -136,8 +138,9 @@ class CameraFlow:
             before, after = (self._velocity_of(other, closeness)[axis] for other in samples)
             total += (after - before) / (2 * STEP)
         ray, derivatives = sample.ray(self.sensor)[0], ray_derivatives(self.sensor, sample)
-        less, more = (self._velocity(ray, derivatives, closeness * (1 + side * STEP)) for side in (-1, 1))
-        return total + dr.dot(more - less, mi.Vector2f(*cell.slopes(corners))) / (2 * STEP * closeness)
+        h = STEP * dr.maximum(closeness, self.mean_closeness)
+        less, more = (self._velocity(ray, derivatives, closeness + side * h) for side in (-1, 1))
+        return total + dr.dot(more - less, mi.Vector2f(*cell.slopes(corners))) / (2 * h)
 
     def moves_at(self, position: mi.Point2f) -> mi.Bool:
         """Return True: the velocity may be non-zero everywhere."""
@@ -162,9 +165,8 @@ class CameraFlow:
 
         ``derivatives`` are those of the ray along the film's axes.
         """
-        r = dr.rcp(closeness)
-        δp = (ray.o - dr.detach(ray.o)) + r * (ray.d - dr.detach(ray.d))
-        return -film_velocity(δp, derivatives, r)
+        motion = closeness * (ray.o - dr.detach(ray.o)) + (ray.d - dr.detach(ray.d))
+        return -film_velocity(motion, derivatives, closeness)
 
 
 def _is_carried(sensor: mi.Sensor) -> bool:
@@ -186,7 +188,7 @@ def _closeness(scene: mi.Scene, sensor: mi.Sensor) -> mi.Float:
 
     Parallax is proportional to reciprocal distances. Rays that miss all surfaces do not count: edges move with the
     surfaces in front of a background, and a background has no edges of its own. Bright parts of the sky have no
-    parallax: see `lights`.
+    parallax (see `lights`): their closeness is zero.
     """
     seen = SeenLights.of(scene, sensor)
     with dr.suspend_grad():
@@ -198,6 +200,9 @@ def _closeness(scene: mi.Scene, sensor: mi.Sensor) -> mi.Float:
         dr.eval(closeness, visible, mean)
         sums = NodeSums.of(dr.select(visible, mi.Float(1), 0))
         nodes = (K_0 * mean + sums.of_values(closeness)) / (K_0 + sums.total())
-        nodes = dr.select(nodes > 0, nodes, 1) * dr.maximum(seen.share_kept(seen.sky), FARTHEST)
+        if sensor.class_name() == ORTHOGRAPHIC:  # any closeness but zero gives the same flow
+            nodes = dr.select(nodes > 0, nodes, 1)
+        else:
+            nodes *= seen.share_kept(seen.sky)
         dr.eval(nodes)
         return nodes

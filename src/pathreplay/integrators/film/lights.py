@@ -1,9 +1,9 @@
-"""Lights that the camera sees, from which film flows keep away.
+"""Lights that the camera sees, near which film flows are zero.
 
-Film positions that move across a static light must sample its edge and the motion of all its radiance. Both are large,
-and cancel on average only. In the disc of the sun of a `sunsky`, only the second part can be sampled, because the edge
-of the disc is no edge of a surface. A film flow is therefore zero near static lights, and contains no parallax near
-bright parts of the sky.
+If film positions moved across a static light, the motion of its edge and of its whole radiance would have to be
+sampled. Both terms are large, and they cancel only on average. In the disc of the sun of a `sunsky`, the first term
+would even be missing, because the edge of the disc is not the edge of a surface. A film flow is therefore zero near
+static lights, and contains no parallax near bright parts of the sky.
 """
 
 from __future__ import annotations
@@ -14,41 +14,44 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.integrators.film.grid import CELLS, REACH, distance_to
-from pathreplay.integrators.film.sample import film_velocity, probes_of, ray_derivatives
+from pathreplay.integrators.film.sample import ORTHOGRAPHIC, film_velocity, probes_of, ray_derivatives
+from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 
 BRIGHT = 2.0
-"""Density per steradian above which a part of the sky is bright; the density of uniform directions is 0.08."""
-ORTHOGRAPHIC = "OrthographicCamera"
+"""Density per steradian of an emitter's samples above which a part of the sky is bright; uniform samples have 0.08."""
+MOST = 8
+"""Largest number of sampled points of emitters, relative to the number of probe rays."""
 AWAY = 1.5 / CELLS
 """Distance from a light, in film widths, up to which a flow is zero. It exceeds the diagonal of a cell of the grid."""
 
 
 @dataclass(frozen=True)
 class SeenLights:
-    """Points of lights that may be visible at film positions."""
+    """Film positions at which lights may be visible."""
 
     position: mi.Point2f
     hit: mi.PreliminaryIntersection3f  # what the camera sees at the position
     sky: mi.Bool  # a bright part of the sky is visible
-    shape: mi.Bool  # a shape that emits light is visible
+    shape: mi.Bool  # a shape that emits light towards the camera is visible
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor) -> SeenLights:
-        """Sample points of lights as they are sampled from the sensor's position. The result is detached."""
+        """Test the positions of probe rays, and positions at which points of emitters would be visible; detached."""
         with dr.suspend_grad():
             sample = probes_of(sensor)
-            origin = dr.zeros(mi.Interaction3f)
-            origin.p = sample.ray(sensor)[0].o
-            sampler = CounterSampler.of(dr.arange(mi.UInt32, dr.width(sample.position)))
-            light, _ = scene.sample_emitter_direction(origin, sampler.next_2d(), False)
-            position, inside = _position_of(sensor, light.p)
-            hit = scene.ray_intersect_preliminary(mi.Ray3f(sample.at(position).ray(sensor)[0]), coherent=False)
-            active = (light.pdf > 0) & ~light.delta & inside
-            flags, glows = light.emitter.flags(), hit.shape.emitter() != None  # noqa: E711
-            bright = light.pdf * len(scene.emitters()) > BRIGHT
-            sky = active & mi.has_flag(flags, mi.EmitterFlags.Infinite) & bright & ~hit.is_valid()
-            shape = active & mi.has_flag(flags, mi.EmitterFlags.Surface) & hit.is_valid() & glows
+            probes = dr.width(sample.position)
+            per_probe = min(-(-len(scene.emitters()) // probes), MOST)
+            position, inside, bright = _emitters_on_film(scene, sensor, max(per_probe, 1) * probes)
+            position = mi.Point2f(*(dr.concat([sample.position[k], position[k]]) for k in (0, 1)))
+            inside = dr.concat([dr.full(mi.Bool, True, probes), inside])
+            bright = dr.concat([dr.full(mi.Bool, False, probes), bright])
+            ray = mi.Ray3f(sample.at(position).ray(sensor)[0])
+            hit = scene.ray_intersect_preliminary(ray, coherent=False, active=inside)
+            met = inside & hit.is_valid()
+            si = hit.compute_surface_interaction(ray, compat.minimal(), met)
+            glows = dr.any(si.emitter(scene, met).eval(si, met) > 0)
+            sky, shape = inside & bright & ~hit.is_valid(), met & glows
             dr.eval(position, hit, sky, shape)
             return SeenLights(position, hit, sky, shape)
 
@@ -57,18 +60,33 @@ class SeenLights:
         return dr.square(dr.clip((distance_to(self.position, near) - AWAY) / REACH, 0, 1))
 
 
-def _position_of(sensor: mi.Sensor, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
-    """Return the film position at which the camera would see a point, and whether it lies on the film.
+def _emitters_on_film(scene: mi.Scene, sensor: mi.Sensor, n: int) -> tuple[mi.Point2f, mi.Bool, mi.Bool]:
+    """Sample n points of emitters with extent, as seen from the camera, and project them onto the film.
 
-    Mitsuba's orthographic camera does not project points, but its film positions are linear functions of points.
+    All emitters get equally many points; if there are more than n, one in several gets a point. Returns the positions,
+    and two masks: whether a position lies on the film, and whether the point is a bright part of the sky.
     """
+    count = len(scene.emitters())
+    if count == 0:
+        return dr.zeros(mi.Point2f, n), dr.full(mi.Bool, False, n), dr.full(mi.Bool, False, n)
+    i = dr.arange(mi.UInt32, n)
+    origin, sources = dr.zeros(mi.Interaction3f, n), probes_of(sensor).ray(sensor)[0].o
+    origin.p = dr.gather(mi.Point3f, sources, i % dr.width(sources))
+    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), i % count if count <= n else i * (count // n))
+    light, _ = emitter.sample_direction(origin, CounterSampler.of(i).next_2d(), True)
+    sky, extended = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite), (light.pdf > 0) & ~light.delta
     if sensor.class_name() == ORTHOGRAPHIC:
+        # Mitsuba does not project points here, but film positions are linear functions of points. All rays see the same
+        # point of the sky.
         middle = probes_of(sensor).at(mi.Point2f(0.5))
         ray = middle.ray(sensor)[0]
-        t = dr.dot(p - ray.o, ray.d)
-        position = mi.Point2f(middle.position + film_velocity(p - ray(t), ray_derivatives(sensor, middle), t))
-        return position, (t > 0) & dr.all((position >= 0) & (position <= 1))
-    point = dr.zeros(mi.Interaction3f)
-    point.p = p
+        t = dr.dot(light.p - ray.o, ray.d)
+        motion = film_velocity(light.p - ray(t), ray_derivatives(sensor, middle), mi.Float(1))
+        position = mi.Point2f(middle.position + motion)
+        return position, extended & ~sky & (t > 0) & dr.all((position >= 0) & (position <= 1)), mi.Bool(sky)
+    distance = dr.sqrt(sensor.near_clip() * sensor.far_clip())  # a projection leaves out what is beyond the clips
+    point = dr.zeros(mi.Interaction3f, n)
+    point.p = dr.select(sky, origin.p + distance * light.d, light.p)
     seen, _ = sensor.sample_direction(point, mi.Point2f(0.5))
-    return mi.Point2f(seen.uv) / mi.ScalarVector2f(sensor.film().crop_size()), seen.pdf > 0
+    position = mi.Point2f(seen.uv) / mi.ScalarVector2f(sensor.film().crop_size())
+    return position, extended & (seen.pdf > 0), sky & (light.pdf > BRIGHT)

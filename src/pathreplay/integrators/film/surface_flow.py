@@ -16,10 +16,11 @@ velocity at a node of a grid is the mean
 over nearby points, where r is their distance from the node on the film. Static points contribute with u = 0. Between
 nodes, v is interpolated. The constant K_0 is the weight of the velocity zero. In a narrow field of view, u is large,
 and film positions that follow u cause more noise than fixed film positions. S is inversely proportional to the square
-of the field of view, so S reduces v in a narrow field of view.
+of the field of view, so S reduces v in a narrow field of view. Finally, v is multiplied by a share that is 0 near
+static lights (see `lights`) and where moving surfaces have no silhouettes.
 
 The derivative of the image does not depend on the choice of v (see `camera_flow`). With the choice above, the interior
-and boundary terms have to differentiate little motion.
+and boundary terms have to differentiate little motion near silhouettes.
 """
 
 from __future__ import annotations
@@ -30,21 +31,27 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import tangents
-from pathreplay.integrators.film.camera_flow import CAMERAS
 from pathreplay.integrators.film.grid import Cell, NodeSums, interpolated, is_near
 from pathreplay.integrators.film.lights import SeenLights
-from pathreplay.integrators.film.sample import Sample, film_velocity, move_with_position, probes_of, ray_derivatives
+from pathreplay.integrators.film.sample import (
+    CAMERAS,
+    Sample,
+    film_velocity,
+    move_with_position,
+    probes_of,
+    ray_derivatives,
+)
 from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.meet import meet
-from pathreplay.transport.motion import have_gradients, may_move
+from pathreplay.transport.motion import have_gradients, is_one_of, may_move, shapes_with_gradients
 from pathreplay.transport.vertex import TraceConfig
 
 K_0 = 1e3
 """Weight that favours fixed film positions."""
 STEEP, ENOUGH = 0.5, 0.02
 """STEEP is the cosine below which an angle is grazing. ENOUGH is the fraction of grazing angles near a node, and the
-variance of normals, from which on the flow is not reduced."""
+variance of normals, at and above which the flow is kept in full."""
 GRAZING, NARROW = 0.1, 0.004
 """GRAZING is the cosine below which W levels off. NARROW is S times the square of the film's width in radians."""
 
@@ -75,11 +82,11 @@ class SurfaceFlow:
             cos, wide = dr.dot(dr.detach(si.n), ray.d), dr.squared_norm(derivatives[0][0] + t * derivatives[1][0])
             grazing, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / wide
             W = dr.select(visible, grazing + S, 0)
-            u = film_velocity(si.p - dr.detach(si.p), derivatives, t) * grazing / (grazing + S)
-            moves = visible & may_move(trace, hit)
+            u = film_velocity((si.p - dr.detach(si.p)) / t, derivatives, dr.rcp(t)) * grazing / (grazing + S)
+            moves = visible & _may_move(trace, hit)
             dr.eval(u, W, moves)  # evaluate once: every node gathers from these arrays
 
-            share = _limbs(moves, mi.Vector3f(dr.detach(si.n)), dr.abs(cos)) * _away_from_lights(trace, sensor)
+            share = _near_silhouettes(moves, mi.Vector3f(dr.detach(si.n)), cos) * _away_from_lights(trace, sensor)
             sums = NodeSums.of(W)
             total = K_0 + sums.total()
             nodes = mi.Vector2f(*(share * sums.of_values(u[k]) / total for k in (0, 1)))
@@ -116,23 +123,33 @@ class SurfaceFlow:
             tangents(self.nodes)
 
 
-def _limbs(moves: mi.Bool, n: mi.Vector3f, cos: mi.Float) -> mi.Float:
-    """Return, for each node of the grid, the share of the flow for which there is a reason: 1 near silhouettes.
+def _may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+    """Return the lanes whose surface may move, also where `may_move` returns True in all lanes."""
+    if trace.traits.moving is None and (shapes := shapes_with_gradients(trace.scene)) is not None:
+        return is_one_of(shapes, hit)
+    return may_move(trace, hit)
 
-    Moving surfaces that are curved are seen at grazing angles near the node. Walls and floors have no silhouettes, and
-    need no flow.
+
+def _near_silhouettes(moves: mi.Bool, n: mi.Vector3f, cos: mi.Float) -> mi.Float:
+    """Return the share of the flow that is kept at each node: 1 near silhouettes of curved surfaces, 0 on flat ones.
+
+    At a silhouette, moving surfaces are seen at grazing angles, and their normals vary. Following a surface that is
+    flat near the node would only add noise. ``cos`` is the cosine between normal ``n`` and ray.
     """
+    n = dr.select(cos > 0, -n, n)
     around = NodeSums.of(dr.select(moves, mi.Float(1), 0), wide=True)
     count = dr.maximum(around.total(), dr.smallest(mi.Float))
     mean = mi.Vector3f(*(around.of_values(n[k]) / count for k in range(3)))
-    grazing = around.of_values(dr.select(cos < STEEP, mi.Float(1), 0)) / count
+    grazing = around.of_values(dr.select(dr.abs(cos) < STEEP, mi.Float(1), 0)) / count
     return dr.clip(grazing / ENOUGH, 0, 1) * dr.clip((1 - dr.squared_norm(mean)) / ENOUGH, 0, 1)
 
 
 def _away_from_lights(trace: TraceConfig, sensor: mi.Sensor) -> mi.Float:
-    """Return, for each node of the grid, the share of the flow that static lights leave: see `lights`."""
+    """Return the share of the flow that is kept at each node: 0 near static lights that are visible, see `lights`."""
+    if trace.hide_emitters:
+        return mi.Float(1)
     seen = SeenLights.of(trace.scene, sensor)
-    return seen.share_kept(seen.sky | (seen.shape & ~may_move(trace, seen.hit)))
+    return seen.share_kept(seen.sky | (seen.shape & ~_may_move(trace, seen.hit)))
 
 
 def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:

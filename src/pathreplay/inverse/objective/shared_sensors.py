@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.integrators.camera_pass import Which
-from pathreplay.integrators.film.camera_flow import PINHOLE
 from pathreplay.integrators.film.image import fit_film
+from pathreplay.integrators.film.sample import PINHOLE
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.owned_arrays import owned
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeGuard, TypeVar
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -34,11 +34,6 @@ INSTANCE, PROJECTOR, SPOT, SUNSKY = "Instance", "Projector", "SpotLight", "Sunsk
 DIRECTED_AREA = "DirectionalArea"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Entries of `Tables.groups_at`: WHOLE for shapes whose only edges are outlines, FACETS for flat-shaded meshes."""
-VARIED = 1e-3
-"""Difference of unit tangents above which tangents vary."""
-COARSE = 1.0
-"""Mean angle in degrees between geometric and shading normals above which a mesh is coarse."""
-
 MOST_RUNS = 4096
 """Largest number of runs of equal values in an array that `_array` creates while `dr.freeze` records."""
 
@@ -83,8 +78,6 @@ class Traits:
     directed_areas: bool  # some emitter is a `directionalarea`, which camera paths do not find
     broken_lights: bool  # the samples of some emitter are discontinuous: see `_bounding_sphere`
     sphere_lights: bool  # some sphere emits
-    coarse_meshes: bool  # some smooth-shaded mesh is coarse: see `is_coarse`
-    brushed_meshes: bool  # some coarse mesh has a BSDF that depends on the tangent
     painted_meshes: bool  # some mesh emits with a textured radiance
     renumbered: bool  # some sampled component may differ from its number in ``component``: see `_delta_weight`
     copies: bool  # there are instances
@@ -97,6 +90,8 @@ class Traits:
     glossy: bool  # `narrow` is True, and there is no checkerboard, whose seams boundary terms do not cover
     outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
     tables: Tables = None  # type: ignore[assignment]  # for the current pass, like all fields below
+    coarse_meshes: bool = False  # some smooth-shaded mesh is coarse: see `facets`
+    brushed_meshes: tuple[mi.Shape, ...] = ()  # meshes whose triangles all count as edges: see `Facets.brushed`
     # The fields `lights_deform` to `lights_vary` tell whether the parameters in their comments have gradients.
     lights_deform: bool = False  # vertex positions of an emissive mesh
     instances_move: bool = False  # the to_world of an instance
@@ -122,7 +117,6 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     others = [
         bsdf for bsdf in bsdfs if not _is_made_of(bsdf, ATTACHABLE) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     ]
-    coarse, brushed = facets_of(shapes)
     masked = [n for bsdf in bsdfs if bsdf.class_name() == MASK for n in nodes_of(bsdf) if isinstance(n, mi.BSDF)]
     blends = [bsdf for bsdf in bsdfs if bsdf.class_name() == BLEND]
     narrow = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
@@ -138,8 +132,6 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         directed_areas=any(light.class_name() == DIRECTED_AREA for light in scene.emitters()),
         broken_lights=any(_bounding_sphere(shape)[3] > 0 for shape in shapes if shape.is_emitter()),
         sphere_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
-        coarse_meshes=coarse,
-        brushed_meshes=brushed,
         painted_meshes=any(is_painted(s.emitter()) for s in shapes if s.is_emitter() and is_mesh(s)),
         renumbered=any(bsdf.class_name() in (TWO_SIDED, BLEND) for bsdf in bsdfs),
         copies=any(shape.class_name() == INSTANCE for shape in shapes),
@@ -218,55 +210,6 @@ def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
 
     begins = _by_index(mi.ShapePtr, shapes, begin, WHOLE)
     return _array(mi.UInt32, begins), _array(mi.UInt32, np.concatenate(blocks).astype(np.uint32))
-
-
-def is_smooth_mesh(shape: mi.Shape) -> TypeGuard[mi.Mesh]:
-    """Return whether a shape is a mesh that is shaded with vertex normals."""
-    return is_mesh(shape) and not shape.has_face_normals() and compat.has_normals(shape)
-
-
-def facets_of(shapes: Iterable[mi.Shape]) -> tuple[bool, bool]:
-    """Return `Traits.coarse_meshes` and `Traits.brushed_meshes` for the current vertices of the meshes among shapes."""
-    smooth = [shape for shape in shapes if is_smooth_mesh(shape)]
-    coarse = [mesh for mesh in smooth if is_coarse(mesh)]
-    brushed = (mesh for mesh in smooth if is_brushed(mesh.bsdf()))
-    return bool(coarse), any(mesh in coarse or has_varied_tangents(mesh) for mesh in brushed)
-
-
-def has_varied_tangents(mesh: mi.Mesh) -> bool:
-    """Return whether the tangents ∂p/∂u differ between triangles. Mitsuba's are constant in each triangle."""
-    data = compat.mesh_arrays(mi.traverse(mesh))
-    if data is None or not len(data.texcoords):
-        return False
-    a, b, c = (data.positions[data.faces[:, i]].astype(np.float64) for i in range(3))
-    x, y, z = (data.texcoords[data.faces[:, i]].astype(np.float64) for i in range(3))
-    u, v = y - x, z - x
-    tangents = (b - a) * v[:, 1:] - (c - a) * u[:, 1:]
-    tangents *= np.sign(u[:, :1] * v[:, 1:] - u[:, 1:] * v[:, :1])
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-30)
-    return bool(np.ptp(tangents, axis=0).max() > VARIED)
-
-
-def is_coarse(mesh: mi.Mesh) -> bool:
-    """Return whether triangles deviate from their shading normals by more than `COARSE` degrees on average.
-
-    Near the silhouette, such triangles occlude emitters that lie above the horizon of the shading normal.
-    """
-    if (data := compat.mesh_arrays(mi.traverse(mesh))) is None:
-        return False
-    a, b, c = (data.positions[data.faces[:, i]].astype(np.float64) for i in range(3))
-    n = np.cross(b - a, c - a)
-    cosines = (
-        np.einsum("fk,fik->fi", n, data.normals[data.faces]) / np.maximum(np.linalg.norm(n, axis=1), 1e-30)[:, None]
-    )
-    return bool(np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean() > COARSE)
-
-
-def is_brushed(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF, or one nested in it, depends on the shading tangent."""
-    if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):
-        return True
-    return any(isinstance(node, mi.BSDF) and node.class_name() in RELIEFS for node in {bsdf, *nodes_of(bsdf)})
 
 
 def emitter_bounds(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:

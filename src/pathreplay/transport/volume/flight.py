@@ -243,8 +243,9 @@ def fly_again(
         if trace.baseline is not None:
             σ_bar = majorant(medium, ray, in_medium)
             guesses = [σ * _guess(trace, y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
-            # With κ, y moves unlike x. The motion then has little noise, and is left out of the control variate.
-            l, J = (length, stretch) if κ is None else dr.detach((length, stretch))
+            l, J = length, stretch
+            if κ is not None:  # y moves unlike x; the motion has little noise, and needs no control variate
+                l, J = dr.select(κ > 0, dr.detach(l), l), dr.select(κ > 0, dr.detach(J), J)
             score = dr.select(through, l / POINTS * sum(guesses), 0)
             scored = event
             for grid in trace.media.grids:
