@@ -104,8 +104,9 @@ class CameraFlow:
         rest = _is_carried(sensor) or bool(with_gradients(sensor, *OTHERS[1:]))
         others = any(with_gradients(node) for node in (*scene.shapes(), *scene.emitters()))
         alone = not (rest or others or with_gradients(sensor, "medium"))
-        # Without a rest, the flow does not depend on the distance.
-        closeness = _closeness(scene, sensor) if rest else dr.full(mi.Float, 1, NODES * NODES)
+        if not rest:  # the flow does not depend on the distance
+            return CameraFlow(sensor, dr.full(mi.Float, 1, NODES * NODES), mi.Float(1), rest, alone)
+        closeness = _closeness(scene, sensor)
         mean = dr.mean(closeness)
         mean = dr.select(mean > 0, mean, 1)
         dr.eval(mean)
