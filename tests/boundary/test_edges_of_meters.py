@@ -15,7 +15,10 @@ HEIGHT = 0.5
 
 @pytest.mark.parametrize("radius", [0.3, 0.05])
 def test_the_shadow_of_a_ball_on_a_meter(radius: float) -> None:
-    """A ball of radius r subtends π r² cos / d² at each point of the meter, so that the derivative is known."""
+    """At a point of the meter, the ball blocks the irradiance π r² cos / d², for distance d and angle to the normal.
+
+    The mean of cos / d² over a square is its solid angle, seen from the ball, divided by its area.
+    """
     mi.set_variant(VARIANT)
     meter = {"type": "irradiancemeter", "film": {"type": "hdrfilm", "width": 1, "height": 1}}
     meter["film"]["rfilter"] = {"type": "box"}

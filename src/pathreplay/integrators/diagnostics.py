@@ -99,9 +99,9 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
         )
     if traits.skies_move and trace.attach != "none":
         yield (
-            "a sunsky has gradients, whose part of the sky is wrong, because its samples move with the sun, and which "
-            "lack the motion of the edge of the sun's disc; use attach = 'none' for sun_direction of a sky without sun "
-            "(sun_scale = 0), or an envmap; see docs/gradients.md"
+            "gradients of a sunsky are wrong: its samples of the sky move with the sun, and the motion of the edge of "
+            "the sun's disc is missing; use attach = 'none' for sun_direction of a sky without sun (sun_scale = 0), or "
+            "an envmap; see docs/gradients.md"
         )
     if trace.attach != "all":
         return

@@ -25,8 +25,8 @@ BY_APERTURE = frozenset({"DistantSensorImpl"})
 """Classes of sensors whose rays depend on the aperture sample only. The film position takes its place here, so that
 rays differ between film positions."""
 PIXELS = {"DistantSensorImpl": 32, "IrradianceMeter": 8}
-"""Resolution assumed for sensors of which each pixel sees the whole scene: a segment of half a pixel would miss most
-objects."""
+"""Resolution assumed for sensors whose pixels each see the whole scene. Segments of half a pixel would miss small
+objects. With shorter segments, fewer cross an edge, and the noise is higher."""
 QUADRATURE = 128
 """Number of quadrature points of the integral over a filter."""
 
