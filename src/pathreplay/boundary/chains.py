@@ -107,7 +107,7 @@ def _probe_vertex(trace: TraceConfig, path: PathState, key: mi.UInt32, active: m
     if not (traits.coarse_meshes or traits.brushed_meshes):
         return probe
     triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)
-    if traits.brushed_meshes:
+    if traits.brushed_meshes:  # the tangents of lobes jump at every edge between triangles
         jumps = dr.select(is_one_of(traits.brushed_meshes, at.hit), triangle, 0)
         probe = replace(probe, signature=mixed(probe.signature, jumps))
     if not traits.coarse_meshes:

@@ -38,9 +38,7 @@ DETACHED = {"Ellipsoids": "put 'ellipsoidsmesh' in its place", "LinearCurve": "p
 """Classes of shapes that Mitsuba 3.9 does not attach to their parameters, with the remedy."""
 BATCH = "BatchSensor"
 """Class of sensors whose rays cannot be differentiated with respect to film position: Dr.Jit terminates the process."""
-FILM_LENGTH = (
-    0.5  # length of segments on the film, in pixels; shorter if a pixel sees the whole scene: see `FilmPlaces`
-)
+FILM_LENGTH = 0.5  # length of segments on the film, in pixels; shorter for some sensors: see `FilmPlaces.detail`
 INNER_LENGTHS = 0.25, 0.1  # length of segments in the unit square of emitter samples; length of arcs in radians
 
 

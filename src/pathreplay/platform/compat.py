@@ -152,22 +152,22 @@ def mesh_arrays(params: Mapping[str, object]) -> MeshArrays | None:
 
 def positions_array(mesh: mi.Mesh) -> mi.Float:
     """Return the vertex positions of a mesh as a flat, detached array of Dr.Jit."""
-    if hasattr(mesh, "vertex_positions_buffer"):  # faster, in 3.9
-        return mi.Float(dr.detach(mesh.vertex_positions_buffer()))
-    params = mi.traverse(mesh)
-    positions = dr.detach(next(params[name] for name in POSITIONS if name in params))
-    return mi.Float(positions.array if dr.is_tensor_v(positions) else positions)
+    return mi.Float(dr.detach(_buffer(mesh, "vertex_positions_buffer", *POSITIONS)))
 
 
 def faces_array(mesh: mi.Mesh) -> mi.UInt32 | None:
     """Return the faces of a mesh as a flat array of Dr.Jit, or None if they are not accessible (see `mesh_arrays`)."""
-    if hasattr(mesh, "faces_buffer"):  # faster, in 3.9
-        return mi.UInt32(mesh.faces_buffer())
+    faces = _buffer(mesh, "faces_buffer", _FACES)
+    return None if faces is None else mi.UInt32(faces)
+
+
+def _buffer(mesh: mi.Mesh, method: str, *names: str) -> mi.Float | mi.UInt32 | None:
+    """Return a flat array of a mesh by its accessor or, without one, by the first of its parameter names; or None."""
+    if hasattr(mesh, method):  # faster, in 3.9
+        return getattr(mesh, method)()
     params = mi.traverse(mesh)
-    if _FACES not in params:
-        return None
-    faces = params[_FACES]
-    return mi.UInt32(faces.array if dr.is_tensor_v(faces) else faces)
+    value = next((params[name] for name in names if name in params), None)
+    return value.array if dr.is_tensor_v(value) else value
 
 
 def _rows(params: Mapping[str, object], names: tuple[str, str], width: int) -> NDArray[np.float32]:

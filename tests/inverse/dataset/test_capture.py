@@ -126,7 +126,7 @@ WIDE, HIGH = 0.5 * WIDTH / math.tan(0.3), 0.5 * HEIGHT / math.tan(0.25)
 def test_focal_lengths_of_both_axes_are_read(
     table: dict[str, float], frame: dict[str, float], focal: tuple[float, float]
 ) -> None:
-    """Those of a frame replace all of the file's, so that no frame gets oblong pixels from half of them."""
+    """If a frame gives one focal length, those of the file are ignored for both axes: pixels then stay square."""
     write({**table, "frames": [{**FRAMES[0], **frame}]})
     (photo,) = photos_of_json(Path("capture/transforms.json"), picture_size)
     assert (photo.lens.fx, photo.lens.fy) == pytest.approx(focal)

@@ -9,6 +9,7 @@ depends on the distance r between probe ray and node on the film.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import TypeVar
@@ -33,6 +34,16 @@ def probe_position(i: mi.UInt32) -> mi.Point2f:
     return (mi.Point2f(i % PROBES, i // PROBES) + 0.5) / PROBES
 
 
+def peaked(r2: mi.Float) -> mi.Float:
+    """Return K for the squared distance ``r2``: see the module."""
+    return dr.square(dr.maximum(1 - r2 / REACH**2, 0) / (r2 + NEAR**2))
+
+
+def wide(r2: mi.Float) -> mi.Float:
+    """Return a kernel without a peak, which reaches further: max(1 - (r / WIDE)², 0)²."""
+    return dr.square(dr.maximum(1 - r2 / WIDE**2, 0))
+
+
 @dataclass(frozen=True)
 class NodeSums:
     """Sums over all probe rays, for each node, with the weights K w."""
@@ -41,19 +52,12 @@ class NodeSums:
     i: mi.UInt32  # probe ray of each pair
 
     @staticmethod
-    def of(weights: mi.Float, wide: bool = False) -> NodeSums:
-        """Compute the weights; ``weights`` are the w of the probe rays.
-
-        If ``wide``, K = max(1 - (r / WIDE)², 0)².
-        """
+    def of(weights: mi.Float, kernel: Callable[[mi.Float], mi.Float] = peaked) -> NodeSums:
+        """Compute the weights; ``weights`` are the w of the probe rays, and ``kernel`` computes K from r²."""
         index = dr.arange(mi.UInt32, NODES * NODES * PROBES * PROBES)
         node, i = index // (PROBES * PROBES), index % (PROBES * PROBES)
         r2 = dr.squared_norm(mi.Point2f(_cell_of(node)) / CELLS - probe_position(i))
-        if wide:
-            K = dr.square(dr.maximum(1 - r2 / WIDE**2, 0))
-        else:
-            K = dr.square(dr.maximum(1 - r2 / REACH**2, 0) / (r2 + NEAR**2))
-        return NodeSums(K * dr.gather(mi.Float, weights, i), i)
+        return NodeSums(kernel(r2) * dr.gather(mi.Float, weights, i), i)
 
     def total(self) -> mi.Float:
         return self._sum(self.K)
@@ -66,7 +70,7 @@ class NodeSums:
 
 
 def distance_to(positions: mi.Point2f, valid: mi.Bool) -> mi.Float:
-    """Return the distance of each node from the nearest of the ``valid`` positions; infinite if there is none."""
+    """Return the distance between each node and the nearest ``valid`` position; infinite without such a position."""
     n = dr.width(positions)
     index = dr.arange(mi.UInt32, NODES * NODES * n)
     node, i = index // n, index % n

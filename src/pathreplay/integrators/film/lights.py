@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.integrators.film.grid import CELLS, REACH, distance_to
-from pathreplay.integrators.film.sample import ORTHOGRAPHIC, film_velocity, probes_of, ray_derivatives
+from pathreplay.integrators.film.sample import ORTHOGRAPHIC, Sample, film_velocity, probes_of, ray_derivatives
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 
@@ -42,7 +42,7 @@ class SeenLights:
             sample = probes_of(sensor)
             probes = dr.width(sample.position)
             per_probe = min(-(-len(scene.emitters()) // probes), MOST)
-            position, inside, bright = _emitters_on_film(scene, sensor, max(per_probe, 1) * probes)
+            position, inside, bright = _emitters_on_film(scene, sensor, sample, max(per_probe, 1) * probes)
             position = mi.Point2f(*(dr.concat([sample.position[k], position[k]]) for k in (0, 1)))
             inside = dr.concat([dr.full(mi.Bool, True, probes), inside])
             bright = dr.concat([dr.full(mi.Bool, False, probes), bright])
@@ -60,8 +60,10 @@ class SeenLights:
         return dr.square(dr.clip((distance_to(self.position, near) - AWAY) / REACH, 0, 1))
 
 
-def _emitters_on_film(scene: mi.Scene, sensor: mi.Sensor, n: int) -> tuple[mi.Point2f, mi.Bool, mi.Bool]:
-    """Sample n points of emitters with extent, as seen from the camera, and project them onto the film.
+def _emitters_on_film(
+    scene: mi.Scene, sensor: mi.Sensor, sample: Sample, n: int
+) -> tuple[mi.Point2f, mi.Bool, mi.Bool]:
+    """Sample n points of emitters with extent, as seen from the origins of camera rays, and project them onto the film.
 
     All emitters get equally many points; if there are more than n, one in several gets a point. Returns the positions,
     and two masks: whether a position lies on the film, and whether the point is a bright part of the sky.
@@ -70,7 +72,7 @@ def _emitters_on_film(scene: mi.Scene, sensor: mi.Sensor, n: int) -> tuple[mi.Po
     if count == 0:
         return dr.zeros(mi.Point2f, n), dr.full(mi.Bool, False, n), dr.full(mi.Bool, False, n)
     i = dr.arange(mi.UInt32, n)
-    origin, sources = dr.zeros(mi.Interaction3f, n), probes_of(sensor).ray(sensor)[0].o
+    origin, sources = dr.zeros(mi.Interaction3f, n), sample.ray(sensor)[0].o
     origin.p = dr.gather(mi.Point3f, sources, i % dr.width(sources))
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), i % count if count <= n else i * (count // n))
     light, _ = emitter.sample_direction(origin, CounterSampler.of(i).next_2d(), True)
@@ -78,7 +80,7 @@ def _emitters_on_film(scene: mi.Scene, sensor: mi.Sensor, n: int) -> tuple[mi.Po
     if sensor.class_name() == ORTHOGRAPHIC:
         # Mitsuba does not project points here, but film positions are linear functions of points. All rays see the same
         # point of the sky.
-        middle = probes_of(sensor).at(mi.Point2f(0.5))
+        middle = sample.at(mi.Point2f(0.5))
         ray = middle.ray(sensor)[0]
         t = dr.dot(light.p - ray.o, ray.d)
         motion = film_velocity(light.p - ray(t), ray_derivatives(sensor, middle), mi.Float(1))

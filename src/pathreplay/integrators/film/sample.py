@@ -47,9 +47,9 @@ def probes_of(sensor: mi.Sensor) -> Sample:
 
 
 def film_velocity(motion: mi.Vector3f, derivatives: RayDerivatives, closeness: mi.Float) -> mi.Vector2f:
-    """Return, by least squares, the film velocity of points on the rays, whose distances have the reciprocal closeness.
+    """Return, by least squares, the film velocity of points on the rays at the distance 1 / ``closeness``.
 
-    ``motion`` is the velocity of the points times the closeness, which may be zero for directions.
+    ``motion`` is the velocity of the points times the closeness. For points at infinity, it is that of the directions.
     """
     x, y = (closeness * o_k + d_k for o_k, d_k in zip(*derivatives, strict=True))
     xx, xy, yy = dr.dot(x, x), dr.dot(x, y), dr.dot(y, y)

@@ -25,13 +25,13 @@ and boundary terms have to differentiate little motion near silhouettes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import tangents
-from pathreplay.integrators.film.grid import Cell, NodeSums, interpolated, is_near
+from pathreplay.integrators.film.grid import Cell, NodeSums, interpolated, is_near, wide
 from pathreplay.integrators.film.lights import SeenLights
 from pathreplay.integrators.film.sample import (
     CAMERAS,
@@ -44,7 +44,7 @@ from pathreplay.integrators.film.sample import (
 from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.meet import meet
-from pathreplay.transport.motion import have_gradients, is_one_of, may_move, shapes_with_gradients
+from pathreplay.transport.motion import have_gradients, may_move, shapes_with_gradients
 from pathreplay.transport.vertex import TraceConfig
 
 K_0 = 1e3
@@ -78,12 +78,14 @@ class SurfaceFlow:
             si = hit.compute_surface_interaction(ray, flags, visible)
             if not (dr.grad_enabled(si.p) and have_gradients(trace.scene, mi.Shape)):
                 return None
+            if trace.traits.moving is None:  # `may_move` would return True in all lanes
+                trace = replace(trace, traits=replace(trace.traits, moving=shapes_with_gradients(trace.scene)))
             derivatives = ray_derivatives(sensor, sample)
-            cos, wide = dr.dot(dr.detach(si.n), ray.d), dr.squared_norm(derivatives[0][0] + t * derivatives[1][0])
-            grazing, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / wide
+            cos, step = dr.dot(dr.detach(si.n), ray.d), derivatives[0][0] + t * derivatives[1][0]
+            grazing, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / dr.squared_norm(step)
             W = dr.select(visible, grazing + S, 0)
             u = film_velocity((si.p - dr.detach(si.p)) / t, derivatives, dr.rcp(t)) * grazing / (grazing + S)
-            moves = visible & _may_move(trace, hit)
+            moves = visible & may_move(trace, hit)
             dr.eval(u, W, moves)  # evaluate once: every node gathers from these arrays
 
             share = _near_silhouettes(moves, mi.Vector3f(dr.detach(si.n)), cos) * _away_from_lights(trace, sensor)
@@ -123,13 +125,6 @@ class SurfaceFlow:
             tangents(self.nodes)
 
 
-def _may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Return the lanes whose surface may move, also where `may_move` returns True in all lanes."""
-    if trace.traits.moving is None and (shapes := shapes_with_gradients(trace.scene)) is not None:
-        return is_one_of(shapes, hit)
-    return may_move(trace, hit)
-
-
 def _near_silhouettes(moves: mi.Bool, n: mi.Vector3f, cos: mi.Float) -> mi.Float:
     """Return the share of the flow that is kept at each node: 1 near silhouettes of curved surfaces, 0 on flat ones.
 
@@ -137,7 +132,7 @@ def _near_silhouettes(moves: mi.Bool, n: mi.Vector3f, cos: mi.Float) -> mi.Float
     flat near the node would only add noise. ``cos`` is the cosine between normal ``n`` and ray.
     """
     n = dr.select(cos > 0, -n, n)
-    around = NodeSums.of(dr.select(moves, mi.Float(1), 0), wide=True)
+    around = NodeSums.of(dr.select(moves, mi.Float(1), 0), wide)
     count = dr.maximum(around.total(), dr.smallest(mi.Float))
     mean = mi.Vector3f(*(around.of_values(n[k]) / count for k in range(3)))
     grazing = around.of_values(dr.select(dr.abs(cos) < STEEP, mi.Float(1), 0)) / count
@@ -149,7 +144,7 @@ def _away_from_lights(trace: TraceConfig, sensor: mi.Sensor) -> mi.Float:
     if trace.hide_emitters:
         return mi.Float(1)
     seen = SeenLights.of(trace.scene, sensor)
-    return seen.share_kept(seen.sky | (seen.shape & ~_may_move(trace, seen.hit)))
+    return seen.share_kept(seen.sky | (seen.shape & ~may_move(trace, seen.hit)))
 
 
 def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:

@@ -73,7 +73,10 @@ def is_coarse(mesh: mi.Mesh) -> bool:
 
 
 def has_jumps(mesh: mi.Mesh) -> bool:
-    """Return whether tangents ∂p/∂u deviate from those of neighbouring triangles by more than `COARSE` degrees."""
+    """Return whether neighbouring triangles differ in their tangents ∂p/∂u by more than `COARSE` degrees on average.
+
+    The tangent of a triangle is compared with the mean tangents at its vertices.
+    """
     data = compat.mesh_arrays(mi.traverse(mesh))
     if data is None or not len(data.texcoords):
         return False
