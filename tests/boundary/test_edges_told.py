@@ -166,15 +166,24 @@ def test_plastic_leaves_out_a_lobe_whose_whole_colour_is_black(
     assert len([line for line in log.lines if "diffuse_reflectance = 0 of" in line]) == count
 
 
-@pytest.mark.parametrize(("bsdf", "scale", "count"), [("conductor", 1.0, 1), ("conductor", 0.0, 0), ("mask", 1.0, 0)])
-def test_a_script_is_told_of_suns_in_mirrors(bsdf: str, scale: float, count: int, log: Any) -> None:
-    sky = {"type": "sunsky", "sun_scale": scale, "sun_direction": [0, 1, -1]}
+@pytest.mark.parametrize(
+    ("bsdf", "sun", "sky_scale", "told"),
+    [
+        ("conductor", 1.0, 1.0, "the motion of its horizon and of the edge of the sun's disc, "),
+        ("conductor", 0.0, 1.0, "the motion of its horizon, "),
+        ("conductor", 1.0, 0.0, "the motion of the edge of the sun's disc, "),
+        ("mask", 1.0, 1.0, ""),
+    ],
+)
+def test_a_script_is_told_of_suns_in_mirrors(bsdf: str, sun: float, sky_scale: float, told: str, log: Any) -> None:
+    sky = {"type": "sunsky", "sun_scale": sun, "sky_scale": sky_scale, "sun_direction": [0, 1, -1]}
     material = {"type": bsdf, **({"nested": {"type": "diffuse"}} if bsdf == "mask" else {})}
     scene, key = make_scene(cube={"type": "cube", "bsdf": material}, sky=sky), "cube.vertex_positions"
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
     with attached(scene, key):
         dr.backward(dr.mean(mi.render(scene, mi.traverse(scene), integrator=integrator, spp=1), axis=None))
-    assert len([line for line in log.lines if "sun's disc" in line]) == count
+    lines = [line for line in log.lines if "delta lobes and a sunsky" in line]
+    assert len(lines) == bool(told) and all(told in line for line in lines)
 
 
 def test_a_mesh_without_faces_is_refused() -> None:

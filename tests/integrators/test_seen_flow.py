@@ -21,6 +21,7 @@ from pathreplay.integrators.film.sample import Sample
 from pathreplay.integrators.film.surface_flow import SurfaceFlow
 from pathreplay.testing.objective import Objective
 from pathreplay.testing.statistics import gap
+from pathreplay.testing.stencil import CENTRAL
 from pathreplay.testing.verdict import Z_LIMIT
 from pathreplay.transport.facts.nodes import nodes_of
 from pathreplay.transport.facts.seams import has_seams
@@ -188,6 +189,44 @@ def test_a_sun_in_the_view_does_not_move_with_what_is_near(mover: str, scale: fl
     found = np.mean([objective.backward(integrator, seed, 64) for seed in range(6)])
     objective.put(dr.opaque(mi.Float, 0))
     assert abs(found) < 0.2 * image.mean()
+
+
+HORIZON = {"type": "sunsky", "to_world": T().rotate([1, 0, 0], -90), "sun_scale": 0.0}
+
+
+def under(sky: dict, bsdf: dict, mover: str) -> Objective:
+    camera = sensor(place=T().look_at([0, 0, 3.2], [0, 0, 0], [0, 1, 0]), film=film(width=20, height=20))
+    body = {"type": "sphere", "radius": 0.5, "bsdf": bsdf}
+    scene = mi.load_dict({"type": "scene", "camera": camera, "sky": sky, "body": body}, optimize=False)
+    objective = Objective(scene, mi.traverse(scene), f"{mover}.to_world", translate(0.5, 1, 0))
+    objective.weigh(np.full((20, 20, 3), 1 / 1200) * np.linspace(0.5, 1.5, 20)[:, None, None])
+    return objective
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "mover"),
+    [(PAINT, "body"), (PAINT, "camera"), ({"type": "roughconductor", "alpha": 0.1}, "body")],
+    ids=["ball", "camera", "glossy"],
+)
+def test_a_horizon_stays_where_it_is(bsdf: dict, mover: str) -> None:
+    """A sunsky is black below its horizon, and no surface has an edge there."""
+    objective = under(HORIZON, bsdf, mover)
+    ours, plain = (mi.load_dict({"type": name, "max_depth": 2}) for name in ("pathreplay", "path"))
+    g = np.array([objective.backward(ours, seed, 64) for seed in range(8)])
+    d = np.array([objective.dot(objective.difference(plain, CENTRAL, 0.02, 100 + s, 512)) for s in range(8)])
+    objective.put(dr.opaque(mi.Float, 0))
+    found = gap(g, d)
+    assert abs(found.z) < Z_LIMIT and found.error < 0.1 * abs(d.mean()), found
+
+
+def test_a_small_sun_in_the_view_makes_no_rare_large_passes() -> None:
+    """One path in some thousands meets it, and must not decide what all other paths are compared with."""
+    objective = under({**HORIZON, "sun_scale": 1.0, "sky_scale": 0.0, "sun_direction": [0.12, 0.35, -1]}, PAINT, "body")
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    g = np.array([objective.backward(ours, seed, 32) for seed in range(32)])
+    objective.put(dr.opaque(mi.Float, 0))
+    off = np.abs(g - np.median(g))
+    assert off.max() < 20 * np.median(off), np.sort(g)
 
 
 def test_noise_inside_one_colour_falls_with_the_size_of_the_film(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -115,13 +115,17 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
 
 
 def sun_note(trace: TraceConfig) -> str:
-    """Format the message about the sun of a `sunsky` in a scene with mirrors or glass; "" without such a sun."""
-    skies = [light for light in trace.scene.emitters() if light.class_name() == SUNSKY]
-    if not any(map(is_specular, trace.traits.mirrors)) or not any(mi.traverse(sky)["sun_scale"] > 0 for sky in skies):
+    """Format the message about the edges of a `sunsky` in a scene with mirrors or glass; "" without such edges."""
+    if not any(map(is_specular, trace.traits.mirrors)):
+        return ""
+    skies = [mi.traverse(light) for light in trace.scene.emitters() if light.class_name() == SUNSKY]
+    scales = {"sky_scale": "of its horizon", "sun_scale": "of the edge of the sun's disc"}
+    edges = [edge for scale, edge in scales.items() if any(sky[scale] > 0 for sky in skies)]
+    if not edges:
         return ""
     return (
-        "something moves in a scene with delta lobes and a sunsky: the motion of the edge of the sun's disc, which is "
-        "seen through glass or mirrors, is missing from the gradient; use a directional emitter and sun_scale = 0"
+        f"something moves in a scene with delta lobes and a sunsky: the motion {' and '.join(edges)}, as seen through "
+        "glass or mirrors, is missing from the gradient; use an envmap, and a directional emitter in place of the sun"
     )
 
 

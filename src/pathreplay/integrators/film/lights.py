@@ -2,8 +2,9 @@
 
 If film positions moved across a static light, the motion of its edge and of its whole radiance would have to be
 sampled. Both terms are large, and they cancel only on average. In the disc of the sun of a `sunsky`, the first term
-would even be missing, because the edge of the disc is not the edge of a surface. A film flow is therefore zero near
-static lights, and contains no parallax near bright parts of the sky.
+would even be missing, because the edge of the disc is not the edge of a surface. The same is true at the horizon of a
+`sunsky`, below which its radiance is zero. A film flow is therefore zero near static lights, and contains no parallax
+near bright parts of the sky or near the border between emitting and black parts of the sky.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.integrators.film.grid import CELLS, REACH, distance_to
+from pathreplay.integrators.film.grid import CELLS, PROBES, REACH, distance_to
 from pathreplay.integrators.film.sample import ORTHOGRAPHIC, Sample, film_velocity, probes_of, ray_derivatives
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
@@ -32,7 +33,7 @@ class SeenLights:
 
     position: mi.Point2f
     hit: mi.PreliminaryIntersection3f  # what the camera sees at the position
-    sky: mi.Bool  # a bright part of the sky is visible
+    sky: mi.Bool  # a bright part of the sky, or the border of a black part, is visible
     shape: mi.Bool  # a shape that emits light towards the camera is visible
 
     @staticmethod
@@ -50,14 +51,28 @@ class SeenLights:
             hit = scene.ray_intersect_preliminary(ray, coherent=False, active=inside)
             met = inside & hit.is_valid()
             si = hit.compute_surface_interaction(ray, compat.minimal(), met)
-            glows = dr.any(si.emitter(scene, met).eval(si, met) > 0)
-            sky, shape = inside & bright & ~hit.is_valid(), met & glows
+            glows = inside & dr.any(si.emitter(scene, inside).eval(si, inside) > 0)  # where nothing is hit: the sky
+            border = _borders(inside & ~met & glows, inside & ~met & ~glows)
+            sky, shape = (inside & bright & ~met) | border, met & glows
             dr.eval(position, hit, sky, shape)
             return SeenLights(position, hit, sky, shape)
 
     def share_kept(self, near: mi.Bool) -> mi.Float:
         """Return the share of a flow that remains at each node of the grid: 0 near the lights in the lanes ``near``."""
         return dr.square(dr.clip((distance_to(self.position, near) - AWAY) / REACH, 0, 1))
+
+
+def _borders(lit: mi.Bool, black: mi.Bool) -> mi.Bool:
+    """Return the lanes with probe rays to ``black`` parts of the sky, next to a probe ray to a ``lit`` part.
+
+    The probe rays are the first lanes, row by row. All other lanes are false.
+    """
+    i, found = dr.arange(mi.UInt32, dr.width(lit)), mi.Bool(False)
+    x, y = mi.Int32(i % PROBES), mi.Int32(i // PROBES)
+    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        beside = (x + dx >= 0) & (x + dx < PROBES) & (y + dy >= 0) & (y + dy < PROBES)
+        found |= dr.gather(mi.Bool, lit, mi.UInt32((y + dy) * PROBES + x + dx), beside)
+    return black & found & (i < PROBES * PROBES)
 
 
 def _emitters_on_film(

@@ -56,6 +56,9 @@ BLUR, MOST = 16, 16
 by 1 / BLUR of the film's shorter side, but by at most MOST pixels. The noise of the term that contains the local mean
 falls with the third power of this length, if the adjoint is smooth over the square."""
 
+TYPICAL = 4.0
+"""See `FilmMotion._mean_radiance`."""
+
 
 @dataclass
 class FlowPaths:
@@ -135,10 +138,11 @@ class FilmMotion(Term):
         return [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *((pixel, mass * scale) for pixel, mass in masses)]
 
     def _mean_radiance(self, view: Pass, trace: TraceConfig) -> mi.Float:
-        """Estimate the mean radiance over the positions at which the flow may be non-zero, from independent paths.
+        """Estimate a typical radiance over the positions at which the flow may be non-zero, from independent paths.
 
-        Subtracting this mean from all radiance reduces noise. The subtraction adds no bias, because motion does not
-        change a constant image.
+        Subtracting it from all radiance reduces noise. The subtraction adds no bias, because motion does not change a
+        constant image. The mean would depend on whether one of the paths meets a small, bright light. Radiance above
+        `TYPICAL` times the squared mean of its square root is therefore clipped.
         """
         width, height = view.size
         pixel = dr.arange(mi.UInt32, width * height)
@@ -146,8 +150,11 @@ class FilmMotion(Term):
         position = (mi.Point2f(pixel % width, pixel // width) + sampler.next_2d()) / mi.Point2f(width, height)
         sample = Sample(view.sensor.shutter_open(), sampler.next_1d(), position, sampler.next_2d())
         moving = dr.full(mi.Bool, True, width * height) & self.flow.moves_at(position)
-        L, _ = _radiance(view, trace, sample, sampler, moving)
-        return dr.sum(dr.mean(L)) / dr.maximum(mi.Float(dr.count(moving)), 1)
+        L = dr.mean(_radiance(view, trace, sample, sampler, moving)[0])
+        dr.eval(L)  # two sums follow
+        n = dr.maximum(mi.Float(dr.count(moving)), 1)
+        most = TYPICAL * dr.square(dr.sum(dr.safe_sqrt(L)) / n)
+        return dr.sum(dr.minimum(L, most)) / n
 
     def _trace(self, view: Pass, trace: TraceConfig) -> FlowPaths:
         width, height = view.size

@@ -88,7 +88,7 @@ class Traits:
     blended_mirrors: bool  # some blend contains lobes of delta reflection or transmission
     narrow: bool  # some surface may have a narrow smooth lobe
     glossy: bool  # `narrow` is True, and there is no checkerboard, whose seams boundary terms do not cover
-    outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
+    outlines: bool  # a surface point may see the outline of a shape or emitter, a texture seam, or a sunsky's horizon
     tables: Tables = None  # type: ignore[assignment]  # for the current pass, like all fields below
     coarse_meshes: bool = False  # some smooth-shaded mesh is coarse: see `facets`
     brushed_meshes: tuple[mi.Shape, ...] = ()  # meshes whose triangles all count as edges: see `Facets.brushed`
@@ -142,7 +142,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         blended_mirrors=any(map(is_specular, blends)),
         narrow=narrow,
         glossy=narrow and not any(node.class_name() == CHECKERBOARD for node in nodes),
-        outlines=not _seamless(shapes, nodes),
+        outlines=not _seamless(shapes, nodes) or any(light.class_name() == SUNSKY for light in scene.emitters()),
     )
 
 
