@@ -227,6 +227,17 @@ def test_choice_of_integrators() -> None:
     assert clear.class_name() == "PathIntegrator"
 
 
+def test_unbounded_paths_of_a_scene_are_not_those_of_ours() -> None:
+    """As in a job. Unbounded paths cannot be recorded, and are nobody's wish: they are the default of `path`."""
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "rr_depth": 7, "hide_emitters": True}})
+    for name in (None, "pathreplay", "pathreplay_particles"):
+        assert read_limits(integrator_under_test(name, scene)) == Limits(6, 7, True)
+    assert read_limits(integrator_under_test("prb", scene)) == Limits(-1, 7, True)
+    assert read_limits(integrator_under_test(None, scene, max_depth=-1)) == Limits(-1, 7, True)
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "pathreplay", "max_depth": -1}})
+    assert read_limits(integrator_under_test("pathreplay", scene)) == Limits(-1, 5, False)
+
+
 @pytest.mark.parametrize("kind", ["prb", "prb_basic", "prbvolpath"])
 def test_another_depth_leaves_the_scenes_own_integrator(kind: str) -> None:
     own = {"type": kind, "max_depth": 6, "rr_depth": 9, "hide_emitters": True}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +46,14 @@ def read_limits(integrator: mi.Integrator) -> Limits | None:
     depth = _whole(max_depth)  # Mitsuba's Python integrators store -1 as UNBOUNDED
     hides = bool(getattr(integrator, "hide_emitters", False))
     return Limits(-1 if depth >= UNBOUNDED else depth, _whole(rr_depth), hides)
+
+
+def without_unbounded(limits: Mapping[str, Any]) -> dict[str, Any]:
+    """Return limits without a ``max_depth`` of -1.
+
+    This default of Mitsuba's integrators is not copied to `pathreplay`, which would have to trace each path twice.
+    """
+    return {name: value for name, value in limits.items() if name != "max_depth" or value >= 0}
 
 
 def _whole(number: Any) -> int:

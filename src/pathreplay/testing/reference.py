@@ -12,7 +12,7 @@ from typing import TypeAlias
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.integrators.path_limits import read_limits
+from pathreplay.integrators.path_limits import read_limits, without_unbounded
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import stateful
 from pathreplay.scenes.descriptions import load_integrator
@@ -41,7 +41,8 @@ def integrator_under_test(
     """Return the integrator that ``spec`` describes: an object (used unchanged), a dictionary, a plugin name, or None.
 
     None selects the scene's own integrator if it is differentiable, else ``pathreplay``. A plugin given by name, or
-    selected by None, gets the path limits of the scene's own integrator. ``max_depth`` replaces the path length of the
+    selected by None, gets the path limits of the scene's own integrator. If these are unbounded, as is the default of
+    ``path``, our plugins keep their own default, as in a job. ``max_depth`` replaces the path length of the
     integrator. ``boundary`` contains additional properties (``boundary``, ``boundary_spp``). With ``boundary``, None
     selects the scene's own integrator if it has these properties, else ``pathreplay``. If the scene's own integrator is
     selected, it keeps its other properties.
@@ -65,8 +66,11 @@ def integrator_under_test(
     else:
         limits = None if own is None else read_limits(own)
         name = spec or _own_name(own, bool(boundary))
-        description = {"type": name, **({} if limits is None else vars(limits))}
         options = {} if own is None or name not in _WITH_BOUNDARY else stateful(own).options()
+        copied = {} if limits is None else vars(limits)
+        if name in _WITH_BOUNDARY and not options:
+            copied = without_unbounded(copied)
+        description = {"type": name, **copied}
         if name == PARTICLES:
             options.pop("caustics", None)
         kept = ("boundary", "boundary_spp", "caustics") if spec else tuple(options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from pathreplay.integrators.path_limits import Limits, read_limits
+from pathreplay.integrators.path_limits import Limits, read_limits, without_unbounded
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
@@ -29,16 +29,18 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
         own: integrator object that takes the place of the job's integrator.
 
     Returns:
-        The completed job, and a note if the integrators of job and targets have different limits.
+        The completed job, and notes: the integrators of job and targets have different limits, or images are the
+        targets and the paths of the scene's integrator are unbounded, unlike those of the job.
 
     Raises:
         PathreplayError: an integrator cannot be created.
     """
-    if "integrator" not in config.model_fields_set and (options := _options(scene.integrator())):
+    copies = "integrator" not in config.model_fields_set
+    if copies and (options := _options(scene.integrator())):
         config = config.model_copy(update={"integrator": Plugin(type="pathreplay", **options)})
-    if config.brings_pictures:
-        return config, ()
     limits = read_limits(load_integrator(config.integrator.model_dump()) if own is None else own)
+    if config.brings_pictures:
+        return config, _bounded(limits, scene.integrator()) if copies and own is None else ()
     asked = config.target.integrator
     if asked is not None:
         return config, _differences(limits, read_limits(load_integrator(asked.model_dump())), config)
@@ -54,8 +56,17 @@ def _options(own: mi.Integrator | None) -> Json:
         return {}
     if options := stateful(own).options():
         return vars(limits) | options
-    # Mitsuba's default max_depth, -1 (unbounded), is not copied: `pathreplay` would have to trace each path twice.
-    return {name: value for name, value in vars(limits).items() if name != "max_depth" or value >= 0}
+    return without_unbounded(vars(limits))
+
+
+def _bounded(limits: Limits | None, own: mi.Integrator | None) -> tuple[str, ...]:
+    unbounded = None if own is None else read_limits(own)
+    if limits is None or unbounded is None or unbounded.max_depth == limits.max_depth or unbounded.max_depth >= 0:
+        return ()
+    return (
+        f"the path length of the scene's integrator is unbounded, and the job takes max_depth = {limits.max_depth}: if "
+        "longer paths are visible in the target images, set max_depth in [integrator]",
+    )
 
 
 def _differences(ours: Limits | None, theirs: Limits | None, config: Config) -> tuple[str, ...]:
