@@ -7,6 +7,8 @@ real one is compared in expectation.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -270,7 +272,7 @@ def test_lane_by_lane(case: Case) -> None:
 
 @pytest.mark.parametrize("case", _params(CELLS, QUICK_CELLS))
 def test_in_expectation(case: Case) -> None:
-    hold(case)
+    hold(replace(case, seeds=6) if case.name in QUICK_CELLS else case)  # their errors are far below the limit
 
 
 def test_the_sun_turns() -> None:

@@ -86,11 +86,11 @@ def test_gradients_are_those_of_reverse_mode_and_of_finite_differences(case: str
     job["integrator"] = {"type": "pathreplay", "max_depth": 3}
     problem = build_problem(make_config({**job, **CASES[case]}), wall_room)
     evaluate, values = Evaluator(problem, problem.integrator), start_of(problem)
-    found = [evaluate(values, Shard((0,), 16, (s,), second_order=True), {}) for s in range(24)]
-    back = np.array([flat(evaluate(values, Shard((0,), 16, (s,)), {}).gradients) for s in range(24)])
+    found = [evaluate(values, Shard((0,), 16, (s,), second_order=True), {}) for s in range(12)]
+    back = np.array([flat(evaluate(values, Shard((0,), 16, (s,)), {}).gradients) for s in range(12)])
     ahead = np.array([flat(each.gradients) for each in found])
     difference = ahead - back
-    z = difference.mean(axis=0) / np.hypot(ahead.std(axis=0), back.std(axis=0)) * np.sqrt(24)
+    z = difference.mean(axis=0) / np.hypot(ahead.std(axis=0), back.std(axis=0)) * np.sqrt(12)
     print(f"{case}: gradient {ahead.mean(axis=0)}, z = {z}")
     assert np.abs(z).max() < 4 and np.abs(ahead.mean(axis=0)).max() > 0
 
@@ -130,7 +130,7 @@ def test_a_job_reaches_the_noise_limit_in_a_few_steps(wall_room: Path) -> None:
 
 def test_a_job_that_was_left_goes_on_bit_for_bit(wall_room: Path) -> None:
     run(output="whole")
-    for stop in (0, 2, 5):
+    for stop in (0, 5):
         for state in iterate(
             make_config({**JOB, "optimizer": OPTIMIZER, "iterations": 8, "spp": 16, "output": f"cut{stop}"})
         ):
@@ -219,7 +219,7 @@ def test_minimize_takes_it_by_name_and_steps_are_pure(photos: list[np.ndarray]) 
         return pathreplay.Problem(room(), wanted, pathreplay.View("left", photo), spp=16)
 
     both = pathreplay.Problem.joint([problem(photos[0]), problem(photos[0])])
-    result = pathreplay.minimize(both, "levenberg-marquardt", steps=6, progress=False)
+    result = pathreplay.minimize(both, "levenberg-marquardt", steps=4, progress=False)
     assert result.values[WALL] == pytest.approx([0.7, 0.3, 0.2], abs=0.02)
     wanted = {WALL: pathreplay.Parameter(initial=0.5)}
     alone = pathreplay.Problem(room(), wanted, views(photos), spp=8, deterministic=True)

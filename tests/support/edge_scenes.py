@@ -410,7 +410,7 @@ SHADOWS = [
     cell("shadow_occluder", shadow(), OBJECT, translate(*ASIDE)),
     cell("shadow_lamp", shadow(), "lamp.to_world", translate(*ASIDE)),
     cell("shadow_receiver", shadow(wall=plain), "wall.to_world", UP),
-    cell("shadow_all", shadow(wall=plain), SEVERAL, UP),
+    cell("shadow_all", shadow(wall=plain), SEVERAL, UP, seeds=8),
     cell("shadow_sphere", shadow(lambda: shape(SHADE.scale(0.3), BLACK, "sphere")), OBJECT, translate(*ASIDE)),
     cell("shadow_hard", shadow(lambda: shape(SHADE.scale(0.3), BLACK, "sphere"), light=bulb), OBJECT,
          translate(*ASIDE)),
