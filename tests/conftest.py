@@ -133,6 +133,22 @@ def _sketched(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.fixture
+def without_edge_terms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Back-propagate through no edges, whose kernels take seconds to compile, where only what is told counts.
+
+    That follows from the scene, and from whether anything moves.
+    """
+    from pathreplay.integrators.boundary_term import Boundary
+    from pathreplay.integrators.film.motion import FilmMotion
+    from pathreplay.integrators.particles.boundary import ParticleBoundary
+    from pathreplay.integrators.term import TermResult
+
+    monkeypatch.setattr(Boundary, "backward", lambda *_: TermResult(moves=True))
+    monkeypatch.setattr(ParticleBoundary, "backward", lambda *_: TermResult(moves=True))
+    monkeypatch.setattr(FilmMotion, "backward", lambda *_: TermResult())
+
+
+@pytest.fixture
 def outputs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What the kernel of a notebook would send to the browser, one after the other."""
     sent: list[str] = []

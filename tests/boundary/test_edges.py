@@ -364,7 +364,11 @@ def test_the_cone_around_a_mesh_lamp_follows_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "place"), [("rectangle", scenes.OVERHEAD), ("sphere", scenes.T().translate([1.6, 1.2, 2.5]).scale(0.4))]
+    ("kind", "place"),
+    [
+        ("rectangle", scenes.OVERHEAD),
+        pytest.param("sphere", scenes.T().translate([1.6, 1.2, 2.5]).scale(0.4), marks=pytest.mark.slow),
+    ],
 )
 def test_the_texels_of_a_lamp_are_no_edges(kind: str, place: Any) -> None:
     """Samples of a textured lamp jump between texels. Its shadows still move like those of a lamp without a texture."""

@@ -89,6 +89,7 @@ def test_a_script_is_told_once(key: str, log: Any) -> None:
     assert all(key in line and "pathreplay check" in line for line in told)
 
 
+@pytest.mark.usefixtures("without_edge_terms")
 @pytest.mark.parametrize("far", [0.0, 2000.0])
 def test_a_script_is_told_of_edges_that_are_too_close_to_points(far: float, log: Any) -> None:
     at = mi.ScalarTransform4f().translate([far, 0, 0])
@@ -100,6 +101,7 @@ def test_a_script_is_told_of_edges_that_are_too_close_to_points(far: float, log:
     assert len(told) == (far > 0)
 
 
+@pytest.mark.usefixtures("without_edge_terms")
 def test_a_script_is_told_of_the_samples_of_a_sunsky(log: Any) -> None:
     scene = make_scene(sky={"type": "sunsky", "sun_direction": [0.4, 0.7, 0.5]})
     for attach, times in (("none", 0), ("delta", 1)):
@@ -109,6 +111,7 @@ def test_a_script_is_told_of_the_samples_of_a_sunsky(log: Any) -> None:
         assert len([line for line in log.lines if "gradients of a sunsky are wrong" in line]) == times
 
 
+@pytest.mark.usefixtures("without_edge_terms")
 @pytest.mark.parametrize("kind", ["ellipsoids", "linearcurve"])
 def test_shapes_without_derivatives_are_told_and_refused(kind: str, tmp_path: Path, log: Any) -> None:
     """Their parameters have flags of Mitsuba, or gradients that are wrong."""
@@ -166,6 +169,7 @@ def test_plastic_leaves_out_a_lobe_whose_whole_colour_is_black(
     assert len([line for line in log.lines if "diffuse_reflectance = 0 of" in line]) == count
 
 
+@pytest.mark.usefixtures("without_edge_terms")
 @pytest.mark.parametrize(
     ("bsdf", "sun", "sky_scale", "told"),
     [
@@ -193,6 +197,7 @@ def test_a_mesh_without_faces_is_refused() -> None:
         integrator.render(make_scene(nothing=corners), spp=1)
 
 
+@pytest.mark.usefixtures("without_edge_terms")
 def test_a_script_is_told_of_the_normals_of_curves(log: Any, tmp_path: Path) -> None:
     (tmp_path / "tube.txt").write_text("\n".join(f"{x / 2} {(x % 3) / 4} 0 0.2" for x in range(5)))
     tube = {"type": "bsplinecurve", "filename": str(tmp_path / "tube.txt")}

@@ -353,6 +353,7 @@ def test_colours_on_a_film_with_a_box_filter_are_told_nothing(log: list[str]) ->
     assert not log
 
 
+@pytest.mark.usefixtures("without_edge_terms")
 @pytest.mark.parametrize(
     ("plugin", "more", "left_out"),
     [
@@ -370,6 +371,7 @@ def test_edges_that_light_paths_leave_out_are_told(plugin: dict, more: dict, lef
     assert all(f"'light.position' moves, and the gradient of light paths leaves out {left_out}: " in t for t in told)
 
 
+@pytest.mark.usefixtures("without_edge_terms")
 @BOTH
 def test_edges_that_light_paths_in_media_leave_out_are_told(plugin: dict, log: list[str]) -> None:
     gradient(loaded(misty()), {**plugin, "boundary": "auto"}, "light.position", 4)
@@ -378,6 +380,7 @@ def test_edges_that_light_paths_in_media_leave_out_are_told(plugin: dict, log: l
     assert any(f"the gradient of light paths leaves out {later} and {behind}: " in line for line in log), log
 
 
+@pytest.mark.usefixtures("without_edge_terms")
 def test_edges_in_the_light_of_a_projector_are_told(log: list[str]) -> None:
     scene = loaded(balls("glass", light="projector"))
     gradient(scene, {**PARTICLES, "boundary": "all", "max_depth": 2}, "light.to_world", 4)
@@ -561,6 +564,7 @@ def test_recorded_steps_in_media_are_traced_steps(plugin: dict, monkeypatch: pyt
     np.testing.assert_allclose(steps(made, config, "recorded"), steps(made, config, "traced"), rtol=1e-3)
 
 
+@pytest.mark.slow  # others hold recorded light paths, and recorded edges
 def test_recorded_steps_with_edges_are_traced_steps() -> None:
     """Edges that the camera sees, and edges that the light of the caustic meets."""
     lamp = {
@@ -579,7 +583,7 @@ INFINITE = {
 }
 
 
-@pytest.mark.parametrize("light", INFINITE)
+@pytest.mark.parametrize("light", ["directional", pytest.param("constant", marks=pytest.mark.slow), "envmap"])
 def test_recorded_steps_follow_the_bounds_of_the_scene(light: str) -> None:
     """Light paths from infinite emitters start on the bounding sphere of the scene, which the ball changes here."""
     mi.Bitmap(np.random.default_rng(0).random((4, 8, 3), np.float32)).write("sky.exr")
