@@ -32,6 +32,17 @@ from variant import VARIANT
 RED = "red.reflectance.value"
 README = ROOT / "README.md"
 PAGE = ROOT / "docs" / "library.md"
+#: Scenes that take long, and that a quick test of the command optimises (`test_ordinary_use`).
+BY_COMMAND = ("three_cameras",)
+SHORTER = {
+    "steps=30": "steps=4",
+    "steps=20": "steps=3",
+    "range(10)": "range(3)",
+    "spp=256": "spp=64",
+    "steps=10": "steps=4",
+}
+#: The scene's own depth; kernels of edges take seconds to compile.
+NO_EDGES = {"type": "pathreplay", "max_depth": 3, "boundary": "none"}
 
 
 @pytest.fixture(autouse=True)
@@ -45,21 +56,32 @@ def photos() -> list[np.ndarray]:
     return photos_of_room()
 
 
-def test_the_script_of_the_readme_recovers_a_texture_and_a_colour() -> None:
+@pytest.mark.parametrize("side", [32, pytest.param(64, marks=pytest.mark.slow)])
+def test_the_script_of_the_readme_recovers_a_texture_and_a_colour(side: int) -> None:
+    """With the film that it has, and with a smaller one."""
     script = re.search(r"<!-- begin library-example -->\n```python\n(.*?)```", README.read_text(), re.S)
     assert script is not None
     assert len([line for line in script[1].splitlines() if line.strip()]) <= 12
     names: dict[str, Any] = {}
-    exec(script[1].replace('"llvm_ad_rgb"', repr(VARIANT)), names)
+    text = (
+        script[1].replace('"llvm_ad_rgb"', repr(VARIANT)).replace("width=64, height=64", f"width={side}, height={side}")
+    )
+    assert f"width={side}, " in text
+    exec(text, names)
     errors = np.abs(names["result"].values["back.bsdf.reflectance.data"] - names["texels"])
     assert np.median(errors) < 0.04  # boxes hide some texels
     np.testing.assert_allclose(names["result"].values["red.reflectance.value"], [0.57, 0.043, 0.044], atol=0.02)
 
 
-def test_the_page_runs_as_it_stands() -> None:
-    names: dict[str, Any] = {}
-    for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
-        exec(block.replace('"llvm_ad_rgb"', repr(VARIANT)), names)
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_page_runs_as_it_stands(whole: bool) -> None:
+    """Or with fewer steps and samples."""
+    text, names = PAGE.read_text().replace('"llvm_ad_rgb"', repr(VARIANT)), dict[str, Any]()
+    for long, short in () if whole else SHORTER.items():
+        assert long in text
+        text = text.replace(long, short)
+    for block in re.findall(r"```python\n(.*?)```", text, re.S):
+        exec(block, names)
     assert names["result"].history[-1].loss < names["result"].history[0].loss
 
 
@@ -178,11 +200,17 @@ def interrupted(problem: Problem) -> None:
         pathreplay.minimize(problem, steps=2, callbacks=[fail], progress=False)
 
 
-@pytest.mark.parametrize("call", [evaluated, stepped, interrupted])
-def test_a_scene_keeps_no_gradients(call: Callable[[Problem], None], photos: list[np.ndarray]) -> None:
+@pytest.mark.parametrize(
+    ("call", "edges"),
+    [
+        *((call, "none") for call in (evaluated, stepped, interrupted)),
+        pytest.param(stepped, "auto", marks=pytest.mark.slow),
+    ],
+)
+def test_a_scene_keeps_no_gradients(call: Callable[[Problem], None], edges: str, photos: list[np.ndarray]) -> None:
     """Gradients left in a scene break forward mode in other scenes. The scene keeps the values of the last call."""
     wanted = {TEXTURE: Parameter(initial=0.25), BODY: Parameter(pose="rigid")}
-    problem = Problem(room(), wanted, views(photos), spp=1)
+    problem = Problem(room(), wanted, views(photos), spp=1, integrator={**NO_EDGES, "boundary": edges})
     call(problem)
     assert not with_gradients(problem.scene)
     np.testing.assert_array_equal(mi.traverse(problem.scene)[TEXTURE], np.full((4, 4, 3), 0.25, np.float32))
@@ -226,7 +254,9 @@ def test_regularizers_by_name_are_those_of_the_module(kind: str, photos: list[np
     }[kind]
     values = {key: start + 0.1 * rng.normal(0, 0.1, start.shape)}
     evaluated = [
-        pathreplay.value_and_grad(Problem(room(), {key: entry}, views(photos), spp=1, deterministic=True))(values)
+        pathreplay.value_and_grad(
+            Problem(room(), {key: entry}, views(photos), spp=1, deterministic=True, integrator=NO_EDGES)
+        )(values)
         for entry in (
             Parameter(initial=start),
             Parameter(initial=start, **{kind: 0.3}),
@@ -370,7 +400,7 @@ def test_an_optimizer_object_in_place_of_a_search_sees_new_random_numbers(
 def test_learning_rates_of_parameters_are_those_of_mitsubas_optimizer(key: str, photos: list[np.ndarray]) -> None:
     """The first step of Adam has the length of the rate: of a key, of a glob, and of a pose."""
     entry = Parameter(pose="translation", learning_rate=0.01) if key == BODY else Parameter(learning_rate=0.01)
-    problem = Problem(room(), {key: entry, TEXTURE: None}, views(photos), spp=4)
+    problem = Problem(room(), {key: entry, TEXTURE: None}, views(photos), spp=4, integrator=NO_EDGES)
     result = pathreplay.minimize(problem, mi.ad.Adam(lr=0.1), steps=1, progress=False)
     name = f"{BODY}:translation" if key == BODY else WALL
     for each, rate in ((name, 0.01), (TEXTURE, 0.1)):
@@ -437,7 +467,7 @@ def test_a_pose_a_derived_parameter_and_arrays_as_starts(photos: list[np.ndarray
         return mi.Color3f(share.array)
 
     derived = {WALL: pathreplay.Derived(grey, of=["share"])}
-    problem = Problem(room(), wanted, views(photos), derived=derived)
+    problem = Problem(room(), wanted, views(photos), derived=derived, integrator=NO_EDGES)
     assert set(problem.initial) == {f"{BODY}:translation", TEXTURE, "share"}
     np.testing.assert_array_equal(problem.initial[TEXTURE], start)
     result = pathreplay.minimize(problem, steps=2, progress=False)
@@ -776,7 +806,9 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
         pathreplay.minimize(problem, stages={"iterations": 2}, progress=False)
 
 
-@pytest.mark.parametrize("write", [pytest.param(s, id=s.__name__) for s in SCENES])
+@pytest.mark.parametrize(
+    "write", [pytest.param(s, id=s.__name__, marks=[pytest.mark.slow] * (s.__name__ in BY_COMMAND)) for s in SCENES]
+)
 def test_ordinary_scenes_one_after_the_other(write: Write, tmp_path: Path) -> None:
     """Files of Blender and others, several cameras, media, mono and spectral variants: three steps lower the loss."""
     use = write(tmp_path)

@@ -53,7 +53,9 @@ def written(place: Path, job: dict[str, Any] = JOB) -> Path:
     return place / "job.json"
 
 
-@pytest.mark.parametrize("kind", JOBS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=[pytest.mark.slow] * (k in ("schedule", "search"))) for k in JOBS]
+)
 def test_a_file_gives_the_bits_of_its_job(kind: str, place: Path) -> None:
     """In memory and in a folder, which the command line takes for one of its own."""
     path = written(place, JOBS[kind])

@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pathreplay
-from library_scenes import GREY, OPTIMIZERS, SIDE, TEXTURE, WALL, Descent, Heavy, photos_of_room, room, views
+from library_scenes import GREY, OPTIMIZERS, SIDE, SLOWLY, TEXTURE, WALL, Descent, Heavy, photos_of_room, room, views
 from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.cli import app
 from pathreplay.jobs import optimize
@@ -66,7 +66,7 @@ def test_a_folder_is_that_of_a_job(photos: list[np.ndarray]) -> None:
     assert told.exit_code == 0, told.output
 
 
-@pytest.mark.parametrize("make", OPTIMIZERS.values(), ids=OPTIMIZERS)
+@pytest.mark.parametrize("make", [pytest.param(make, id=name, marks=SLOWLY[name]) for name, make in OPTIMIZERS.items()])
 def test_a_run_that_was_left_goes_on_bit_for_bit(make: Callable[[], Any], photos: list[np.ndarray]) -> None:
     """Left by an error in a callback, before and after a grid is refined."""
     whole = run(problem_of(photos), make(), output="whole")
@@ -247,8 +247,8 @@ def test_ten_scenes_one_after_the_other_leave_nothing_behind() -> None:
         scene = room()
         scene["wall"]["bsdf"]["reflectance"]["value"] = colour
         target = np.array(mi.render(mi.load_dict(scene), sensor=0, spp=64))
-        problem = Problem(room(), {WALL: GREY}, View("left", target), spp=16, learning_rate=0.05)
-        result = run(problem, output=f"runs/{n}", steps=20)
+        problem = Problem(room(), {WALL: GREY}, View("left", target), spp=16, learning_rate=0.08)
+        result = run(problem, output=f"runs/{n}", steps=10)
         assert result.history[-1].loss < 0.5 * result.history[0].loss
         assert np.abs(result.values[WALL] - colour).max() < 0.2, n
     assert len(list(Path("runs").iterdir())) == 10

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pathreplay
-from library_scenes import GREY, OPTIMIZERS, SEARCHES, TEXTURE, WALL, Descent, photos_of_room, room, views
+from library_scenes import GREY, OPTIMIZERS, SEARCHES, SLOWLY, TEXTURE, WALL, Descent, photos_of_room, room, views
 from pathreplay import Parameter, PathreplayError, Problem, State, View
 from pathreplay.platform import memory
 from variant import VARIANT
@@ -42,7 +42,7 @@ def frozen(state: State) -> dict[str, bytes]:
 MAKERS: dict[str, Callable[[], Any]] = {**OPTIMIZERS, **SEARCHES}
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOWLY[name]) for name in MAKERS])
 def test_steps_are_those_of_minimize_and_change_no_state(name: str, photos: list[np.ndarray]) -> None:
     """Forwards; then again from a state in the middle, and from the first, of the same states."""
     make, problem = MAKERS[name], (wall_of if name in SEARCHES else problem_of)(photos)

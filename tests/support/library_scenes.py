@@ -8,6 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+import pytest
 import scipy.optimize
 
 from pathreplay import Parameter, View
@@ -113,4 +114,9 @@ SEARCHES: dict[str, Callable[[], Any]] = {
     "l-bfgs-b": lambda: "l-bfgs-b",
     "slsqp of scipy": lambda: partial(scipy.optimize.minimize, method="SLSQP"),
     "tnc of scipy": lambda: partial(scipy.optimize.minimize, method="TNC"),
+}
+#: Those that go through the library as another of these does.
+SLOWLY: dict[str, Any] = {
+    name: [pytest.mark.slow] if name in ("sgd of mitsuba", "own", "tnc of scipy") else []
+    for name in (*OPTIMIZERS, *SEARCHES)
 }
