@@ -151,7 +151,7 @@ def test_the_gradient_is_that_of_any_flow(tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("name", ["point", pytest.param("gaussian", marks=pytest.mark.slow)])
 def test_noise_is_below_that_of_a_difference(name: str, tmp_path: Path) -> None:
-    hold_quiet(PLACES[name](tmp_path), tmp_path)
+    hold_quiet(PLACES[name](tmp_path), tmp_path, passes=8)
 
 
 def around(light: dict) -> Write:
@@ -161,10 +161,12 @@ def around(light: dict) -> Write:
     return lambda folder: Moving(scene, "camera.to_world", rotate(0.3, 1, 0))
 
 
-@pytest.mark.parametrize("light", [panel(), {"type": "constant"}], ids=["lamp", "sky"])
+@pytest.mark.parametrize(
+    "light", [panel(), pytest.param({"type": "constant"}, marks=pytest.mark.slow)], ids=["lamp", "sky"]
+)
 def test_noise_is_low_around_a_thing_before_a_background(light: dict, tmp_path: Path) -> None:
     """The background has no edges, so that only the distance of the thing counts."""
-    hold_quiet(around(light)(tmp_path), tmp_path)
+    hold_quiet(around(light)(tmp_path), tmp_path, passes=12)
 
 
 def test_on_a_large_film_neighbours_cancel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,8 +190,8 @@ def test_in_fog_only_the_field_of_view_has_a_gradient(tmp_path: Path) -> None:
     objective = loaded(of_camera(sensor(), "x_fov", WIDER, cloud=cloud)(tmp_path), tmp_path)
     ours = mi.load_dict({"type": "pathreplay", "max_depth": 4})
     plain = mi.load_dict({"type": "volpath", "max_depth": 4, "rr_depth": 1000})
-    g = np.array([objective.backward(ours, seed, 256) for seed in range(SEEDS)])
-    d = [objective.dot(objective.difference(plain, CENTRAL, 0.02, seed, 1024)) for seed in range(SEEDS)]
+    g = np.array([objective.backward(ours, seed, 128) for seed in range(SEEDS)])
+    d = [objective.dot(objective.difference(plain, CENTRAL, 0.02, seed, 512)) for seed in range(SEEDS)]
     objective.put(dr.opaque(mi.Float, 0))
     hold_agreement("camera, in fog", g, np.array(d), 0.0)
 

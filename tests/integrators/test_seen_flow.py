@@ -130,6 +130,7 @@ LIT: dict[str, Write] = {
     ),
 }
 """A static light that is seen before something that moves."""
+QUICK_LIT = "painted wall behind a lamp"
 
 
 @pytest.mark.parametrize("name", [n if n == QUICK else pytest.param(n, marks=pytest.mark.slow) for n in CELLS])
@@ -153,13 +154,13 @@ def test_the_gradient_is_that_without_a_flow(name: str, tmp_path: Path, monkeypa
 
 
 def test_noise_is_below_that_of_a_difference(tmp_path: Path) -> None:
-    hold_quiet(CELLS[QUICK](tmp_path), tmp_path)
+    hold_quiet(CELLS[QUICK](tmp_path), tmp_path, passes=8)
 
 
-@pytest.mark.parametrize("name", LIT)
+@pytest.mark.parametrize("name", [n if n == QUICK_LIT else pytest.param(n, marks=pytest.mark.slow) for n in LIT])
 def test_a_static_light_in_the_view_makes_no_noise(name: str, tmp_path: Path) -> None:
     """If film positions moved across the light, two large terms would cancel only on average."""
-    hold_quiet(LIT[name](tmp_path), tmp_path)
+    hold_quiet(LIT[name](tmp_path), tmp_path, passes=8 if name == QUICK_LIT else 24)
 
 
 def test_gradients_of_a_light_bring_no_noise_back(tmp_path: Path) -> None:
@@ -169,7 +170,7 @@ def test_gradients_of_a_light_bring_no_noise_back(tmp_path: Path) -> None:
     for key in (None, "bulb.emitter.radiance.value"):
         if key:
             dr.enable_grad(objective.params[key])
-        spread.append(np.std([objective.backward(integrator, seed, 32) for seed in range(16)]))
+        spread.append(np.std([objective.backward(integrator, seed, 32) for seed in range(6)]))
     objective.put(dr.opaque(mi.Float, 0))
     assert spread[1] < 2 * spread[0]
 

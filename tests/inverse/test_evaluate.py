@@ -122,7 +122,9 @@ BOX = {
 
 
 RECORDED = pytest.mark.parametrize(
-    "changes", [SWEEP, {}, {**SWEEP, "loss": "l1"}, KINDS["medium"]], ids=["sweep", "prb", "l1", "medium"]
+    "changes",
+    [SWEEP, {}, pytest.param({**SWEEP, "loss": "l1"}, marks=pytest.mark.slow), KINDS["medium"]],
+    ids=["sweep", "prb", "l1", "medium"],
 )
 
 

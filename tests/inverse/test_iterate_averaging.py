@@ -123,7 +123,7 @@ def test_a_large_variable_keeps_its_last_iterate(monkeypatch: pytest.MonkeyPatch
 def test_averaging_changes_the_result_of_a_job_but_not_its_iterates(wall_room: Path) -> None:
     key = JOB["parameters"][0]["key"]
     target = {**JOB["target"], "spp": 4096}  # the minimum of a noisy target would be elsewhere
-    fast = {**JOB, "target": target, "iterations": 80, "learning_rate": 0.1, "spp": 1}
+    fast = {**JOB, "target": target, "iterations": 40, "learning_rate": 0.1, "spp": 1}
     on, off = (
         optimize(make_config({**fast, "optimizer": {"iterate_averaging": switch}}), progress=False)
         for switch in (True, False)

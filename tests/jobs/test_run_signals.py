@@ -55,7 +55,7 @@ def test_two_ctrl_c_at_once_abort_in_one_line(tmp_path: Path) -> None:
     assert not list((tmp_path / "run").rglob("*.part"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_before_the_run_folder_a_signal_ends_in_one_line(number: signal.Signals, tmp_path: Path) -> None:
     # Preparation lasts: so many samples for the targets.
     target = {"scene": "room.xml", "spp": 400_000, "integrator": {"type": "path", "max_depth": 3}}

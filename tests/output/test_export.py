@@ -457,7 +457,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "texture.exr").write_bytes(exr_bytes(texels))
     pose = {"key": "right.to_world", "pose": "rigid", "initial": {"translation": [0.1, 0.0, 0.0]}}
     changes = {"iterations": 2, "parameters": [*JOB["parameters"], pose], "scene": str(folder / "room.xml")}
-    changes["integrator"] = {"type": "pathreplay", "max_depth": 3}
+    changes["integrator"] = {"type": "pathreplay", "max_depth": 3, "boundary": "none"}
     changes["target"] = {**JOB["target"], "scene": str(folder / "room.xml")}
     optimize(make_config({**JOB, **changes}), output=folder / "run", progress=False)
     return folder

@@ -98,14 +98,14 @@ def test_derivatives_are_those_of_central_differences(name: str, tmp_path: Path)
 
 @pytest.mark.parametrize("name", [n if n == "lens" else pytest.param(n, marks=pytest.mark.slow) for n in JOBS])
 def test_the_loss_falls_from_the_transport(name: str, tmp_path: Path) -> None:
-    config = job(name, tmp_path, iterations=20, spp=64, learning_rate=RATES[name], warmup_steps=4)
+    config = job(name, tmp_path, iterations=10, spp=64, learning_rate=RATES[name], warmup_steps=4)
     result = optimize(make_config(config), progress=False)
     assert result.history[-1].loss < 0.5 * result.history[0].loss
 
 
 @pytest.mark.parametrize("name", ["two surfaces", "mirror"])
 def test_the_loss_falls_from_flat_surfaces(name: str, tmp_path: Path) -> None:
-    config = job(name, tmp_path, iterations=30, spp=16, learning_rate=4 * RATES[name], warmup_steps=4)
+    config = job(name, tmp_path, iterations=12, spp=16, learning_rate=4 * RATES[name], warmup_steps=4)
     for table in config["parameters"]:
         table.pop("initial", None)
     result = optimize(make_config(config), progress=False)

@@ -127,7 +127,7 @@ def test_light_makes_the_picture(name: str) -> None:
 
     def correlation() -> float:
         particles = mi.load_dict({"type": "ptracer", "max_depth": 4})
-        found = np.array(mi.render(scene, integrator=particles, spp=256))[..., 0]
+        found = np.array(mi.render(scene, integrator=particles, spp=96))[..., 0]
         return float(np.corrcoef(found.ravel(), image.ravel())[0, 1])
 
     flat = correlation()

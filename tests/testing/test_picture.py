@@ -29,9 +29,9 @@ def test_both_images_agree_and_the_scene_is_as_before() -> None:
 
 def test_a_wrong_gradient_is_seen() -> None:
     images = derivative_images(
-        world(), "ball.to_world", seeds=4, spp=1024, integrator={"type": "pathreplay", "boundary": "none"}
+        world(), "ball.to_world", seeds=4, spp=256, integrator={"type": "pathreplay", "boundary": "none"}
     )
-    edges = derivative_images(world(), "ball.to_world", seeds=4, spp=1024)
+    edges = derivative_images(world(), "ball.to_world", seeds=4, spp=256)
     gaps = [np.abs(each.gradient - each.reference).mean() for each in (images, edges)]
     assert gaps[0] > 2 * gaps[1]
 
