@@ -171,18 +171,20 @@ def outputs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run code in a fresh Python: `run_python(code, env={"NAME": "value" or None}, args=[...])`.
 
-    DRJIT_LIBLLVM_PATH, which this process has set for itself, is not handed on; Dr.Jit's cache, which it looks for in
-    the home folder and complains if there is none, is in `tmp_path`. None in `env` removes a variable. Where kernels of
-    tests are not optimised, those of the fresh Python are not, either, unless it is to be `bare`: then it has not
-    loaded a libLLVM before the code runs.
+    DRJIT_LIBLLVM_PATH, which this process has set for itself, is not handed on. None in `env` removes a variable. Where
+    kernels of tests are not optimised, those of the fresh Python are not, either, and both have one cache, unless it is
+    to be `bare`: then it has not loaded a libLLVM before the code runs. Another cache of Dr.Jit, which it looks for in
+    the home folder and complains if there is none, is in `tmp_path`.
     """
 
     def run(
         code: str, env: dict[str, str | None] | None = None, args: tuple[str, ...] = (), bare: bool = False
     ) -> subprocess.CompletedProcess[str]:
+        same = unoptimised.is_asked_for() and not bare
         code = ("" if bare else unoptimised.first_line()) + code
+        cache = os.environ["DRJIT_CACHE_DIR"] if same else str(tmp_path)  # that of unoptimised.keep_apart
         environment = dict(os.environ)
-        for name, value in {"DRJIT_LIBLLVM_PATH": None, "DRJIT_CACHE_DIR": str(tmp_path), **(env or {})}.items():
+        for name, value in {"DRJIT_LIBLLVM_PATH": None, "DRJIT_CACHE_DIR": cache, **(env or {})}.items():
             if value is None:
                 environment.pop(name, None)
             else:

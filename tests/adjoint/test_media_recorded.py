@@ -72,7 +72,9 @@ def hold(scene: dict, key: str, **options: Any) -> None:
     assert difference.max() < 1e-4, difference
 
 
-@pytest.mark.parametrize("name", MEDIA)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "empty in places")) for name in MEDIA]
+)
 def test_recorded_steps_are_those_that_are_traced(name: str) -> None:
     medium, key = MEDIA[name]
     hold(cloud(medium()), key)

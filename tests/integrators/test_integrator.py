@@ -330,7 +330,7 @@ def test_samplers_filters_and_crops(sampler: str, rfilter: str) -> None:
     assert tangent > 0
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+@pytest.mark.parametrize("variant", [pytest.param("llvm_ad_mono", marks=pytest.mark.slow), "llvm_ad_spectral"])
 def test_other_variants_agree_forward_and_reverse(variant: str, run_python) -> None:
     code = f"""
 import pathreplay, mitsuba as mi, drjit as dr, numpy as np

@@ -84,7 +84,7 @@ def test_the_film_flows_with_surfaces_of_the_scene_alone(key: str, flows: bool) 
     assert (part.flow is not None) == flows
 
 
-@pytest.mark.parametrize("key", [COLOUR, "lamp.position"])
+@pytest.mark.parametrize("key", [COLOUR, pytest.param("lamp.position", marks=pytest.mark.slow)])
 def test_gradients_are_the_same(key: str, other: mi.SceneParameters) -> None:
     scene, integrator, found = room(), mi.load_dict({"type": "pathreplay", "max_depth": 3}), []
     for change in (lambda params: None, detach):

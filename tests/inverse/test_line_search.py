@@ -244,7 +244,7 @@ def test_a_job_that_was_left_goes_on_bit_for_bit(wall_room: Path) -> None:
         assert cut.parameters[KEY].tobytes() == whole.parameters[KEY].tobytes()
 
 
-@pytest.mark.parametrize("transform", [None, "logit"])
+@pytest.mark.parametrize("transform", [None, pytest.param("logit", marks=pytest.mark.slow)])
 def test_a_job_that_ended_goes_on_with_a_lower_tolerance(transform: str | None, wall_room: Path) -> None:
     """It then is the job that had the lower tolerance from the beginning, bit for bit."""
     entry = ENTRY if transform is None else {**ENTRY, "parameterization": transform}

@@ -73,6 +73,7 @@ def test_before_the_run_folder_a_signal_ends_in_one_line(number: signal.Signals,
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow  # other tests end a run by a signal, and see all that it writes
 def test_a_closed_terminal_does_not_stop_the_writing(tmp_path: Path) -> None:
     write_job(tmp_path, **ENDLESS)
     pid, terminal = pty.fork()

@@ -123,7 +123,7 @@ def test_a_script_that_was_killed_is_started_again_and_ends_with_the_same_bits()
     assert checkpoint_bits(RUN) == checkpoint_bits(Path("whole"))
 
 
-@pytest.mark.parametrize("joint", [False, True], ids=["one scene", "two scenes"])
+@pytest.mark.parametrize("joint", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["one scene", "two scenes"])
 def test_targets_that_were_rendered_again_do_not_end_a_run(joint: bool, photos: list[np.ndarray]) -> None:
     """Threads sum in any order, so the targets of a second process differ in the last bits: the saved ones are used."""
 

@@ -554,7 +554,7 @@ FOG = """<shape type="cube" id="mist"><bsdf type="null"/>
 </scene>"""
 
 
-@BOTH
+@pytest.mark.parametrize("plugin", [pytest.param(PARTICLES, marks=pytest.mark.slow), CAUSTICS], ids=["all", "caustics"])
 def test_recorded_steps_in_media_are_traced_steps(plugin: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(globals(), "SCENE", SCENE.replace("</scene>", FOG))
     key = "mist.interior_medium.sigma_t.value.value"

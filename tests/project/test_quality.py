@@ -51,7 +51,11 @@ def task() -> Task:
 LOOPS = [lambda *args: Plain(*args, "prb"), lambda *args: Differences(*args, "path"), Own]
 
 
-@pytest.mark.parametrize("begin", LOOPS, ids=["plain", "differences", "pathreplay"])
+@pytest.mark.parametrize(
+    "begin",
+    [pytest.param(LOOPS[0], marks=pytest.mark.slow), *LOOPS[1:]],
+    ids=["plain", "differences", "pathreplay"],
+)
 def test_a_loop_reaches_the_marks_and_one_that_stands_still_does_not(begin: Any, task: Task) -> None:
     gc.collect()  # `prb` traces the emitters of dropped scenes, too, and some of them lack eval_direction
     moving = followed(begin(task, 0.02, 64, 0), task.error, MIDDLE, budget=60)

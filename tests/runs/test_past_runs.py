@@ -76,7 +76,8 @@ def test_integrators_that_a_job_leaves_out_are_no_difference(tmp_path: Path, mon
     """With `--set`, the saved config is completed from the scene; otherwise it is the file."""
     monkeypatch.chdir(tmp_path)
     Path("job.toml").write_text(
-        'scene = "cornell-box"\niterations = 1\nspp = 1\neval_spp = 1\n[target]\nscene = "cornell-box"\nspp = 1\n'
+        'scene = "cornell-box"\niterations = 1\nspp = 1\neval_spp = 1\nscene_parameters = {resolution = 16}\n'
+        '[target]\nscene = "cornell-box"\nscene_parameters = {resolution = 16}\nspp = 1\n'
         '[[parameters]]\nkey = "red.reflectance.value"\ninitial = 0.3\n'
     )
     for folder, changes in (("a", ()), ("b", ("learning_rate=0.5",))):

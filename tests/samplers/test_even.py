@@ -216,7 +216,7 @@ def judged(method: str, made: mi.Scene, spp: int, seeds: range) -> np.ndarray:
     return np.array(found)
 
 
-@pytest.mark.parametrize("spp", [2, 7])
+@pytest.mark.parametrize("spp", [2, pytest.param(7, marks=pytest.mark.slow)])
 def test_pixels_that_are_swept_are_judged_by_others(spp: int) -> None:
     """A path that were judged by its own set would count its own noise: with few samples far above that of the mean."""
     made = scene(spp)

@@ -112,15 +112,18 @@ class Setup(Objective):
         return np.array([picture(seed + k, spp // passes) for k in range(passes)])
 
 
-def measure(config: Config, full: bool = False, boundary: str = "all") -> Found:
-    """Errors of pathreplay's picture, forward and reverse derivative."""
+def measure(config: Config, full: bool = False, boundary: str = "all", part: int = 1) -> Found:
+    """Errors of pathreplay's picture, forward and reverse derivative.
+
+    References have one ``part`` of their samples: their noise counts as errors, which are allowed no more for that.
+    """
     size = config.res if full else min(SMALL, config.res)
     setup = Setup(config, size)
     plain = mi.load_dict({"type": "path", "max_depth": config.depth})
     ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, "boundary": boundary})
 
     wide = config.res // size
-    reference_spp, spp = REFERENCE_SPP * wide ** min(config.rise, 1), config.spp * wide**config.rise
+    reference_spp, spp = REFERENCE_SPP * wide ** min(config.rise, 1) // part, config.spp * wide**config.rise
     places = config.step * ((np.arange(n := setup.passes(spp)) + 0.5) / n - 0.5)
 
     def difference(seed: int, spp: int) -> np.ndarray:

@@ -84,7 +84,13 @@ def test_texels_that_no_path_reaches_follow_their_surroundings() -> None:
     assert (ends[True][0, 0] > 0.6).all()
 
 
-@pytest.mark.parametrize("more", [{}, {"resolutions": [2, 4], "refine_at": [3], "parameterization": "logit"}])
+@pytest.mark.parametrize(
+    "more",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        {"resolutions": [2, 4], "refine_at": [3], "parameterization": "logit"},
+    ],
+)
 def test_a_stopped_job_resumes_to_the_bit(more: dict[str, object], monkeypatch: pytest.MonkeyPatch) -> None:
     settings = {"parameters": [STEPPED[0] | more], "iterations": 6, "deterministic": True}
     whole = run(**settings)
