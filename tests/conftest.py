@@ -45,10 +45,12 @@ READING = {"test_derived", "test_export", "test_particles_in_use", "test_photogr
 TIMEOUT_S = 120
 #: Files that take longest, begun first, so that of several processes none is left alone with one of them.
 LONGEST = ("test_hostile", "test_truth_edges_inner", "test_truth_edges", "test_truth_media", "test_edges_ordinary",
-           "test_mitsuba_configs", "test_edges_in_use", "test_truth_edges_media", "test_pixel_sweep",
-           "test_replay_attached", "test_ordinary_use", "test_primal_media", "test_truth_materials",
-           "test_truth_attached", "test_baselines", "test_inverse_run", "test_motion_noise", "test_variants",
-           "test_inverse_grids", "test_deterministic", "test_volume_example")  # fmt: skip
+           "test_mitsuba_configs", "test_edges_in_use", "test_truth_edges_media", "test_library", "test_seen_flow",
+           "test_particles_in_use", "test_camera_motion", "test_particle_images", "test_truth_materials", "test_check",
+           "test_particle_gradients", "test_gauss_newton", "test_primal_media", "test_run_signals",
+           "test_pixel_sweep", "test_replay_attached", "test_ordinary_use", "test_truth_attached", "test_baselines",
+           "test_inverse_run", "test_motion_noise", "test_variants", "test_inverse_grids", "test_deterministic",
+           "test_volume_example")  # fmt: skip
 
 
 def pytest_configure() -> None:

@@ -92,7 +92,7 @@ QUICK = "box", "catmullrom", "window"
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in PLACES])
 def test_places_that_move_agree_with_differences(name: str, tmp_path: Path) -> None:
-    hold(name, PLACES[name], tmp_path)
+    hold(name, PLACES[name], tmp_path, 6 if name in QUICK else SEEDS)
 
 
 @pytest.mark.slow
@@ -101,8 +101,8 @@ def test_poses_agree_with_differences(name: str, tmp_path: Path) -> None:
     hold(name, POSES[name], tmp_path)
 
 
-def hold(name: str, write: Write, folder: Path) -> None:
-    found = measured(write(folder), folder, SEEDS)
+def hold(name: str, write: Write, folder: Path, seeds: int = SEEDS) -> None:
+    found = measured(write(folder), folder, seeds)
     hold_agreement(f"camera, {name}", found.gradients, found.differences, found.transpose)
 
 
@@ -166,7 +166,7 @@ def around(light: dict) -> Write:
 )
 def test_noise_is_low_around_a_thing_before_a_background(light: dict, tmp_path: Path) -> None:
     """The background has no edges, so that only the distance of the thing counts."""
-    hold_quiet(around(light)(tmp_path), tmp_path, passes=12)
+    hold_quiet(around(light)(tmp_path), tmp_path, passes=8 if light["type"] != "constant" else 24)
 
 
 def test_on_a_large_film_neighbours_cancel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
