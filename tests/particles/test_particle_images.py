@@ -321,8 +321,7 @@ def test_light_paths_in_media_give_the_image_of_volpath(name: str) -> None:
     scene = mi.load_dict(misty(**MISTS[name]))
     # `volpath` loses light of lamps close to a null boundary (`test_a_lamp_close_to_a_null_boundary`).
     reference = "pathreplay" if name == "sphere, grid" else "volpath"
-    effort = (8, 192 if name in QUICK_MISTS else 256)
-    assert both(f"media: {name}", scene, "pathreplay_particles", effort, reference=reference) < Z_LIMIT
+    assert both(f"media: {name}", scene, "pathreplay_particles", (8, 256), reference=reference) < Z_LIMIT
 
 
 @pytest.mark.slow
