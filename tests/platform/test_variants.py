@@ -180,7 +180,7 @@ JOBS = {
 }
 
 
-@pytest.mark.slow  # quick tests of the library optimise scenes in these variants
+@pytest.mark.slow  # the quick tests check and optimise scenes of test_ordinary_use in these variants
 @pytest.mark.parametrize("name", JOBS)
 def test_the_main_job_runs_in_every_variant(run_python, tmp_path, name: str) -> None:
     done = run_python(MAIN_JOB, args=(str(tmp_path), *JOBS[name]))

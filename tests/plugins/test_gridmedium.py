@@ -572,7 +572,7 @@ print("fine")
 """
 
 
-@pytest.mark.parametrize("variant", [SPECTRAL, pytest.param(MONO, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("variant", [SPECTRAL, MONO])
 def test_other_variants(run_python: Any, variant: str) -> None:
     done = run_python(OTHER_VARIANT, args=(variant,))
     assert "fine" in done.stdout, done.stderr  # Mitsuba colours its log, at either end

@@ -21,7 +21,7 @@ from pathreplay import cli
 ITERATIONS = 5
 TIMEOUT_S = 120
 # Of their kinds others are quick: meshes without coordinates, principled, environment maps.
-SLOW = {"plain_obj", "principled_ply", "environment", "smoke", "spectral_room", "mono_room"}
+SLOW = {"plain_obj", "principled_ply", "environment", "smoke", "spectral_room"}
 
 Command = Callable[..., tuple[int, str]]
 
