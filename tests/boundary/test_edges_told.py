@@ -173,8 +173,8 @@ def test_plastic_leaves_out_a_lobe_whose_whole_colour_is_black(
 @pytest.mark.parametrize(
     ("bsdf", "sun", "sky_scale", "told"),
     [
-        ("conductor", 1.0, 1.0, "the motion of its horizon and of the edge of the sun's disc, "),
-        ("conductor", 0.0, 1.0, "the motion of its horizon, "),
+        ("conductor", 1.0, 1.0, "the motion of the sky's horizon and of the edge of the sun's disc, "),
+        ("conductor", 0.0, 1.0, "the motion of the sky's horizon, "),
         ("conductor", 1.0, 0.0, "the motion of the edge of the sun's disc, "),
         ("mask", 1.0, 1.0, ""),
     ],

@@ -228,7 +228,7 @@ def test_choice_of_integrators() -> None:
 
 
 def test_unbounded_paths_of_a_scene_are_not_those_of_ours() -> None:
-    """As in a job. Unbounded paths cannot be recorded, and are nobody's wish: they are the default of `path`."""
+    """As in a job. Unbounded paths are the default of `path`, rarely intended, and cannot be recorded."""
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "rr_depth": 7, "hide_emitters": True}})
     for name in (None, "pathreplay", "pathreplay_particles"):
         assert read_limits(integrator_under_test(name, scene)) == Limits(6, 7, True)

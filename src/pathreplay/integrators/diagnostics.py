@@ -119,13 +119,17 @@ def sun_note(trace: TraceConfig) -> str:
     if not any(map(is_specular, trace.traits.mirrors)):
         return ""
     skies = [mi.traverse(light) for light in trace.scene.emitters() if light.class_name() == SUNSKY]
-    scales = {"sky_scale": "of its horizon", "sun_scale": "of the edge of the sun's disc"}
-    edges = [edge for scale, edge in scales.items() if any(sky[scale] > 0 for sky in skies)]
-    if not edges:
+    scales = {
+        "sky_scale": ("of the sky's horizon", "an envmap"),
+        "sun_scale": ("of the edge of the sun's disc", "a directional emitter and sun_scale = 0"),
+    }
+    found = [words for scale, words in scales.items() if any(sky[scale] > 0 for sky in skies)]
+    if not found:
         return ""
+    edges, remedies = (" and ".join(words) for words in zip(*found, strict=True))
     return (
-        f"something moves in a scene with delta lobes and a sunsky: the motion {' and '.join(edges)}, as seen through "
-        "glass or mirrors, is missing from the gradient; use an envmap, and a directional emitter in place of the sun"
+        f"something moves in a scene with delta lobes and a sunsky: the motion {edges}, as seen through glass or "
+        f"mirrors, is missing from the gradient; use {remedies}"
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,12 +47,12 @@ def read_limits(integrator: mi.Integrator) -> Limits | None:
     return Limits(-1 if depth >= UNBOUNDED else depth, _whole(rr_depth), hides)
 
 
-def without_unbounded(limits: Mapping[str, Any]) -> dict[str, Any]:
-    """Return limits without a ``max_depth`` of -1.
+def without_unbounded(limits: Limits) -> dict[str, int]:
+    """Return limits by name, without a ``max_depth`` of -1, the default of Mitsuba's integrators.
 
-    This default of Mitsuba's integrators is not copied to `pathreplay`, which would have to trace each path twice.
+    It is not copied to `pathreplay`. With unbounded paths, `pathreplay` would trace each path twice.
     """
-    return {name: value for name, value in limits.items() if name != "max_depth" or value >= 0}
+    return {name: value for name, value in vars(limits).items() if name != "max_depth" or value >= 0}
 
 
 def _whole(number: Any) -> int:

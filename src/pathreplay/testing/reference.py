@@ -28,8 +28,8 @@ LONGEST_WITHOUT_ROULETTE = 64
 only at ``max_depth``."""
 
 PARTICLES = "pathreplay_particles"
-_WITH_BOUNDARY = ("pathreplay", PARTICLES)
-"""Plugins with the properties ``boundary`` and ``boundary_spp``."""
+_OURS = ("pathreplay", PARTICLES)
+"""Our plugins, which have the properties ``boundary`` and ``boundary_spp``."""
 
 _ONLY_LIMITS = {"PRBIntegrator": "prb", "BasicPRBIntegrator": "prb_basic", "PRBVolpathIntegrator": "prbvolpath"}
 """Plugins by class, for the differentiable integrators of Mitsuba that have no other properties than `Limits`."""
@@ -66,10 +66,10 @@ def integrator_under_test(
     else:
         limits = None if own is None else read_limits(own)
         name = spec or _own_name(own, bool(boundary))
-        options = {} if own is None or name not in _WITH_BOUNDARY else stateful(own).options()
+        options = {} if own is None or name not in _OURS else stateful(own).options()
         copied = {} if limits is None else vars(limits)
-        if name in _WITH_BOUNDARY and not options:
-            copied = without_unbounded(copied)
+        if limits is not None and name in _OURS and not options:
+            copied = without_unbounded(limits)
         description = {"type": name, **copied}
         if name == PARTICLES:
             options.pop("caustics", None)
@@ -77,7 +77,7 @@ def integrator_under_test(
         description |= {option: options[option] for option in kept if option in options}
     if max_depth is not None:
         description["max_depth"] = max_depth
-    if boundary and description.get("type") not in _WITH_BOUNDARY:
+    if boundary and description.get("type") not in _OURS:
         raise PathreplayError(
             f"'{min(boundary)}' is a property of 'pathreplay', and the integrator is '{description.get('type')}'; test "
             "'pathreplay', or leave it out"

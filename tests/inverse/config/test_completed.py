@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from pathreplay.integrators.path_limits import Limits, read_limits
-from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.inverse.problem.problem import Problem, build_problem
 from pathreplay.jobs import make_config
 from pathreplay.output.export import export_run
@@ -60,18 +59,6 @@ def test_a_job_without_integrator_has_the_depth_and_options_of_the_scenes() -> N
     assert (ours.boundary, ours.adjoint, read_limits(ours)) == ("primary", "replay", Limits(2, 5, True))
     assert read_limits(problem(integrator={"type": "pathreplay"}).integrator) == Limits(6, 5, False)
     assert read_limits(mi.load_dict({"type": "volprim_rf_basic", "max_depth": 9, "rr_depth": 7})) == Limits(9, 7, False)
-
-
-@pytest.mark.parametrize(("depth", "chosen", "count"), [(-1, None, 1), (4, None, 0), (-1, 9, 0)])
-def test_images_may_show_longer_paths_than_a_job_has(depth: int, chosen: int | None, count: int) -> None:
-    Path("photo.exr").write_bytes(exr_bytes(np.full((8, 8, 3), 0.5, np.float32)))
-    Path("scene.xml").write_text(
-        SCENE.format(integrator="path", options="").replace('"max_depth" value="2"', f'"max_depth" value="{depth}"')
-    )
-    own = {} if chosen is None else {"integrator": {"type": "pathreplay", "max_depth": chosen}}
-    found = build_problem(make_config({**JOB, **own, "target": {"images": ["photo.exr"]}}), Path.cwd())
-    told = "path length of the scene's integrator is unbounded, and the job takes max_depth = 6"
-    assert sum(told in note for note in found.notes) == count
 
 
 HIDDEN = '<boolean name="hide_emitters" value="true"/>'

@@ -4,7 +4,7 @@ If film positions moved across a static light, the motion of its edge and of its
 sampled. Both terms are large, and they cancel only on average. In the disc of the sun of a `sunsky`, the first term
 would even be missing, because the edge of the disc is not the edge of a surface. The same is true at the horizon of a
 `sunsky`, below which its radiance is zero. A film flow is therefore zero near static lights, and contains no parallax
-near bright parts of the sky or near the border between emitting and black parts of the sky.
+near bright parts of the sky and near this horizon.
 """
 
 from __future__ import annotations
@@ -14,15 +14,18 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.integrators.film.grid import CELLS, PROBES, REACH, distance_to
+from pathreplay.integrators.film.grid import CELLS, REACH, distance_to
 from pathreplay.integrators.film.sample import ORTHOGRAPHIC, Sample, film_velocity, probes_of, ray_derivatives
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.transport.facts.traits import SUNSKY
 
 BRIGHT = 2.0
 """Density per steradian of an emitter's samples above which a part of the sky is bright; uniform samples have 0.08."""
 MOST = 8
 """Largest number of sampled points of emitters, relative to the number of probe rays."""
+HORIZON = 4096
+"""Number of points on the horizon of a `sunsky`, of which those in the view are projected onto the film."""
 AWAY = 1.5 / CELLS
 """Distance from a light, in film widths, up to which a flow is zero. It exceeds the diagonal of a cell of the grid."""
 
@@ -33,7 +36,7 @@ class SeenLights:
 
     position: mi.Point2f
     hit: mi.PreliminaryIntersection3f  # what the camera sees at the position
-    sky: mi.Bool  # a bright part of the sky, or the border of a black part, is visible
+    sky: mi.Bool  # a bright part of the sky or the horizon of a `sunsky` is visible
     shape: mi.Bool  # a shape that emits light towards the camera is visible
 
     @staticmethod
@@ -43,36 +46,26 @@ class SeenLights:
             sample = probes_of(sensor)
             probes = dr.width(sample.position)
             per_probe = min(-(-len(scene.emitters()) // probes), MOST)
-            position, inside, bright = _emitters_on_film(scene, sensor, sample, max(per_probe, 1) * probes)
-            position = mi.Point2f(*(dr.concat([sample.position[k], position[k]]) for k in (0, 1)))
-            inside = dr.concat([dr.full(mi.Bool, True, probes), inside])
-            bright = dr.concat([dr.full(mi.Bool, False, probes), bright])
+            everywhere, none = dr.full(mi.Bool, True, probes), dr.full(mi.Bool, False, probes)
+            parts = [(sample.position, everywhere, none)]
+            parts.append(_emitters_on_film(scene, sensor, sample, max(per_probe, 1) * probes))
+            parts += [_horizon_on_film(sky, sensor, sample) for sky in scene.emitters() if sky.class_name() == SUNSKY]
+            positions, insides, brights = zip(*parts, strict=True)
+            position = mi.Point2f(*(dr.concat([part[k] for part in positions]) for k in (0, 1)))
+            inside, bright = dr.concat(list(insides)), dr.concat(list(brights))
             ray = mi.Ray3f(sample.at(position).ray(sensor)[0])
             hit = scene.ray_intersect_preliminary(ray, coherent=False, active=inside)
             met = inside & hit.is_valid()
             si = hit.compute_surface_interaction(ray, compat.minimal(), met)
-            glows = inside & dr.any(si.emitter(scene, inside).eval(si, inside) > 0)  # where nothing is hit: the sky
-            border = _borders(inside & ~met & glows, inside & ~met & ~glows)
-            sky, shape = (inside & bright & ~met) | border, met & glows
+            glows = dr.any(si.emitter(scene, met).eval(si, met) > 0)
+            passes = ~met | mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Null)  # the sky is visible
+            sky, shape = inside & bright & passes, met & glows
             dr.eval(position, hit, sky, shape)
             return SeenLights(position, hit, sky, shape)
 
     def share_kept(self, near: mi.Bool) -> mi.Float:
         """Return the share of a flow that remains at each node of the grid: 0 near the lights in the lanes ``near``."""
         return dr.square(dr.clip((distance_to(self.position, near) - AWAY) / REACH, 0, 1))
-
-
-def _borders(lit: mi.Bool, black: mi.Bool) -> mi.Bool:
-    """Return the lanes with probe rays to ``black`` parts of the sky, next to a probe ray to a ``lit`` part.
-
-    The probe rays are the first lanes, row by row. All other lanes are false.
-    """
-    i, found = dr.arange(mi.UInt32, dr.width(lit)), mi.Bool(False)
-    x, y = mi.Int32(i % PROBES), mi.Int32(i // PROBES)
-    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        beside = (x + dx >= 0) & (x + dx < PROBES) & (y + dy >= 0) & (y + dy < PROBES)
-        found |= dr.gather(mi.Bool, lit, mi.UInt32((y + dy) * PROBES + x + dx), beside)
-    return black & found & (i < PROBES * PROBES)
 
 
 def _emitters_on_film(
@@ -101,9 +94,32 @@ def _emitters_on_film(
         motion = film_velocity(light.p - ray(t), ray_derivatives(sensor, middle), mi.Float(1))
         position = mi.Point2f(middle.position + motion)
         return position, extended & ~sky & (t > 0) & dr.all((position >= 0) & (position <= 1)), mi.Bool(sky)
-    distance = dr.sqrt(sensor.near_clip() * sensor.far_clip())  # a projection leaves out what is beyond the clips
-    point = dr.zeros(mi.Interaction3f, n)
-    point.p = dr.select(sky, origin.p + distance * light.d, light.p)
+    p = dr.select(sky, _point_of_sky(sensor, origin.p, light.d), light.p)
+    position, inside = _projected(sensor, p)
+    return position, extended & inside, sky & (light.pdf > BRIGHT)
+
+
+def _horizon_on_film(sky: mi.Emitter, sensor: mi.Sensor, sample: Sample) -> tuple[mi.Point2f, mi.Bool, mi.Bool]:
+    """Project points of the horizon of a `sunsky` onto the film, as `_emitters_on_film` projects points of emitters."""
+    i, origins = dr.arange(mi.UInt32, HORIZON), sample.ray(sensor)[0].o
+    sin, cos = dr.sincos(dr.two_pi / HORIZON * mi.Float(i))
+    d = mi.traverse(sky)["to_world"] @ mi.Vector3f(cos, sin, 0)
+    yes = dr.full(mi.Bool, True, HORIZON)
+    if sensor.class_name() == ORTHOGRAPHIC:  # all rays see the same point of the sky
+        return dr.zeros(mi.Point2f, HORIZON), ~yes, yes
+    origin = dr.gather(mi.Point3f, origins, i % dr.width(origins))
+    position, inside = _projected(sensor, _point_of_sky(sensor, origin, dr.normalize(d)))
+    return position, inside & yes, yes
+
+
+def _point_of_sky(sensor: mi.Sensor, origin: mi.Point3f, d: mi.Vector3f) -> mi.Point3f:
+    """Return a point in direction ``d`` that the sensor can project. It leaves out what is beyond its clips."""
+    return origin + dr.sqrt(sensor.near_clip() * sensor.far_clip()) * d
+
+
+def _projected(sensor: mi.Sensor, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
+    """Return the film position at which a sensor would see the point ``p``, and whether it lies on the film."""
+    point = dr.zeros(mi.Interaction3f, dr.width(p))
+    point.p = p
     seen, _ = sensor.sample_direction(point, mi.Point2f(0.5))
-    position = mi.Point2f(seen.uv) / mi.ScalarVector2f(sensor.film().crop_size())
-    return position, extended & (seen.pdf > 0), sky & (light.pdf > BRIGHT)
+    return mi.Point2f(seen.uv) / mi.ScalarVector2f(sensor.film().crop_size()), seen.pdf > 0

@@ -56,8 +56,8 @@ BLUR, MOST = 16, 16
 by 1 / BLUR of the film's shorter side, but by at most MOST pixels. The noise of the term that contains the local mean
 falls with the third power of this length, if the adjoint is smooth over the square."""
 
-TYPICAL = 4.0
-"""See `FilmMotion._mean_radiance`."""
+CLIP = 4.0
+"""Radiance above CLIP · (mean √L)² is clipped in `FilmMotion._typical_radiance`."""
 
 
 @dataclass
@@ -137,12 +137,12 @@ class FilmMotion(Term):
         scale = dr.select(total > 0, derivative.sign(f.offset) / total, 0)
         return [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *((pixel, mass * scale) for pixel, mass in masses)]
 
-    def _mean_radiance(self, view: Pass, trace: TraceConfig) -> mi.Float:
+    def _typical_radiance(self, view: Pass, trace: TraceConfig) -> mi.Float:
         """Estimate a typical radiance over the positions at which the flow may be non-zero, from independent paths.
 
         Subtracting it from all radiance reduces noise. The subtraction adds no bias, because motion does not change a
-        constant image. The mean would depend on whether one of the paths meets a small, bright light. Radiance above
-        `TYPICAL` times the squared mean of its square root is therefore clipped.
+        constant image. The estimate is a mean of clipped radiance (see `CLIP`). The mean of the radiance itself would
+        depend on whether one of the paths meets a small, bright light.
         """
         width, height = view.size
         pixel = dr.arange(mi.UInt32, width * height)
@@ -153,7 +153,7 @@ class FilmMotion(Term):
         L = dr.mean(_radiance(view, trace, sample, sampler, moving)[0])
         dr.eval(L)  # two sums follow
         n = dr.maximum(mi.Float(dr.count(moving)), 1)
-        most = TYPICAL * dr.square(dr.sum(dr.safe_sqrt(L)) / n)
+        most = CLIP * dr.square(dr.sum(dr.safe_sqrt(L)) / n)
         return dr.sum(dr.minimum(L, most)) / n
 
     def _trace(self, view: Pass, trace: TraceConfig) -> FlowPaths:
@@ -185,7 +185,7 @@ class FilmMotion(Term):
         time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
         sample = Sample(time, sampler.next_1d(), position, sampler.next_2d())
         L, wavelengths = _radiance(view, trace, sample, sampler, self.flow.moves_at(position))
-        L = (L - self._mean_radiance(view, trace)) * weight
+        L = (L - self._typical_radiance(view, trace)) * weight
         return FlowPaths(pixel, sample, axis, single, offset, derivative, L, wavelengths)
 
 

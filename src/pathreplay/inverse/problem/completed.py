@@ -29,18 +29,16 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
         own: integrator object that takes the place of the job's integrator.
 
     Returns:
-        The completed job, and notes: the integrators of job and targets have different limits, or images are the
-        targets and the paths of the scene's integrator are unbounded, unlike those of the job.
+        The completed job, and a note if the integrators of job and targets have different limits.
 
     Raises:
         PathreplayError: an integrator cannot be created.
     """
-    copies = "integrator" not in config.model_fields_set
-    if copies and (options := _options(scene.integrator())):
+    if "integrator" not in config.model_fields_set and (options := _options(scene.integrator())):
         config = config.model_copy(update={"integrator": Plugin(type="pathreplay", **options)})
-    limits = read_limits(load_integrator(config.integrator.model_dump()) if own is None else own)
     if config.brings_pictures:
-        return config, _bounded(limits, scene.integrator()) if copies and own is None else ()
+        return config, ()
+    limits = read_limits(load_integrator(config.integrator.model_dump()) if own is None else own)
     asked = config.target.integrator
     if asked is not None:
         return config, _differences(limits, read_limits(load_integrator(asked.model_dump())), config)
@@ -56,17 +54,7 @@ def _options(own: mi.Integrator | None) -> Json:
         return {}
     if options := stateful(own).options():
         return vars(limits) | options
-    return without_unbounded(vars(limits))
-
-
-def _bounded(limits: Limits | None, own: mi.Integrator | None) -> tuple[str, ...]:
-    unbounded = None if own is None else read_limits(own)
-    if limits is None or unbounded is None or unbounded.max_depth == limits.max_depth or unbounded.max_depth >= 0:
-        return ()
-    return (
-        f"the path length of the scene's integrator is unbounded, and the job takes max_depth = {limits.max_depth}: if "
-        "longer paths are visible in the target images, set max_depth in [integrator]",
-    )
+    return without_unbounded(limits)
 
 
 def _differences(ours: Limits | None, theirs: Limits | None, config: Config) -> tuple[str, ...]:
