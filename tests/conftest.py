@@ -136,17 +136,17 @@ def _sketched(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.fixture
 def without_edge_terms(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Back-propagate through no edges, whose kernels take seconds to compile, where only what is told counts.
+    """Leave out the kernels of edges, which take seconds to compile, in tests of messages.
 
-    That follows from the scene, and from whether anything moves.
+    Messages depend on the scene, and on whether edges move.
     """
     from pathreplay.integrators.boundary_term import Boundary
     from pathreplay.integrators.film.motion import FilmMotion
     from pathreplay.integrators.particles.boundary import ParticleBoundary
     from pathreplay.integrators.term import TermResult
 
-    monkeypatch.setattr(Boundary, "backward", lambda *_: TermResult(moves=True))
-    monkeypatch.setattr(ParticleBoundary, "backward", lambda *_: TermResult(moves=True))
+    for term in (Boundary, ParticleBoundary):
+        monkeypatch.setattr(term, "backward", lambda self, view, trace, *_: TermResult(moves=self.move(view, trace)))
     monkeypatch.setattr(FilmMotion, "backward", lambda *_: TermResult())
 
 
@@ -174,17 +174,16 @@ def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]
     """Run code in a fresh Python: `run_python(code, env={"NAME": "value" or None}, args=[...])`.
 
     DRJIT_LIBLLVM_PATH, which this process has set for itself, is not handed on. None in `env` removes a variable. Where
-    kernels of tests are not optimised, those of the fresh Python are not, either, and both have one cache, unless it is
-    to be `bare`: then it has not loaded a libLLVM before the code runs. Another cache of Dr.Jit, which it looks for in
-    the home folder and complains if there is none, is in `tmp_path`.
+    kernels of tests are not optimised, those of the fresh Python are not, either, and both share one cache. A `bare`
+    Python has not loaded a libLLVM before the code runs, and its cache is in `tmp_path`.
     """
 
     def run(
         code: str, env: dict[str, str | None] | None = None, args: tuple[str, ...] = (), bare: bool = False
     ) -> subprocess.CompletedProcess[str]:
-        same = unoptimised.is_asked_for() and not bare
-        code = ("" if bare else unoptimised.first_line()) + code
-        cache = os.environ["DRJIT_CACHE_DIR"] if same else str(tmp_path)  # that of unoptimised.keep_apart
+        first = "" if bare else unoptimised.first_line()
+        code = first + code
+        cache = os.environ["DRJIT_CACHE_DIR"] if first else str(tmp_path)  # that of unoptimised.keep_apart
         environment = dict(os.environ)
         for name, value in {"DRJIT_LIBLLVM_PATH": None, "DRJIT_CACHE_DIR": cache, **(env or {})}.items():
             if value is None:

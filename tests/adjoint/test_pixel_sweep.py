@@ -88,7 +88,7 @@ def test_image_and_gradient_are_those_of_a_quadratic_loss(case: Case, opened) ->
     """The loss is Σ W (I - T)² with a target T close to the picture, so that judging a path by itself would show."""
     bench = opened(case)
     plain = bench.integrator("path", rr_depth=case.rr_depth, **case.options)
-    expected = np.mean([bench.image(plain, 5000 + seed, 1024) for seed in range(2)], axis=0)
+    expected = np.mean([bench.image(plain, 5000 + seed, 1024) for seed in range(4)], axis=0)
     slope = 2 * bench.weights
     offset = -slope * 0.8 * expected
     adjoint = offset + slope * expected

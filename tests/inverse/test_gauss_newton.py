@@ -90,7 +90,7 @@ def test_gradients_are_those_of_reverse_mode_and_of_finite_differences(case: str
     back = np.array([flat(evaluate(values, Shard((0,), 16, (s,)), {}).gradients) for s in range(12)])
     ahead = np.array([flat(each.gradients) for each in found])
     difference = ahead - back
-    z = difference.mean(axis=0) / np.hypot(ahead.std(axis=0), back.std(axis=0)) * np.sqrt(12)
+    z = difference.mean(axis=0) / np.hypot(ahead.std(axis=0, ddof=1), back.std(axis=0, ddof=1)) * np.sqrt(12)
     print(f"{case}: gradient {ahead.mean(axis=0)}, z = {z}")
     assert np.abs(z).max() < 4 and np.abs(ahead.mean(axis=0)).max() > 0
 

@@ -91,7 +91,7 @@ def test_some_pixels_stand_for_all(film: str, opened) -> None:
     """Image and gradient of a quadratic loss, against Mitsuba's images with the same filter, and their differences."""
     bench = opened(Case(film, lambda: room(**FILMS[film]), FLOOR, random(1.0), spp=4, seeds=64))
     plain = bench.integrator("path", rr_depth=bench.case.rr_depth)
-    expected = np.mean([bench.image(plain, 5000 + seed, 512) for seed in range(4)], axis=0)
+    expected = np.mean([bench.image(plain, 5000 + seed, 1024) for seed in range(4)], axis=0)
     slope = 2 * bench.weights
     offset = -slope * 0.8 * expected
     ours = bench.integrator(rr_depth=bench.case.rr_depth)

@@ -285,7 +285,7 @@ def test_stages_that_refine_poses_are_planned_with_their_own_speed() -> None:
     assert [stage.iterations for stage in plan_stages(speed, 1, 40, 160, 280, posed)] == [LEAST]
 
 
-@pytest.mark.usefixtures("without_edge_terms")  # by a clock that is told what it shows
+@pytest.mark.usefixtures("without_edge_terms")  # the clock is simulated
 def test_passes_with_poses_are_measured(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Planned is what was measured: a clock says 7 s of the first pass, at least 1 s of small and 3 s of large ones."""
     written = pathreplay.from_photos(capture, tmp_path / "job", minutes=0.01)

@@ -32,7 +32,7 @@ from variant import VARIANT
 RED = "red.reflectance.value"
 README = ROOT / "README.md"
 PAGE = ROOT / "docs" / "library.md"
-#: Scenes that take long, and that a quick test of the command optimises (`test_ordinary_use`).
+#: Scenes that take long, and that a quick test optimises by the command line (`test_ordinary_use`).
 BY_COMMAND = ("three_cameras",)
 SHORTER = {
     "steps=30": "steps=4",
@@ -203,8 +203,9 @@ def interrupted(problem: Problem) -> None:
 @pytest.mark.parametrize(
     ("call", "edges"),
     [
-        *((call, "none") for call in (evaluated, stepped, interrupted)),
-        pytest.param(stepped, "auto", marks=pytest.mark.slow),
+        (evaluated, "none"),
+        (interrupted, "none"),
+        (stepped, "auto"),
     ],
 )
 def test_a_scene_keeps_no_gradients(call: Callable[[Problem], None], edges: str, photos: list[np.ndarray]) -> None:

@@ -76,7 +76,8 @@ def null_gpu(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str | None]:
     library = tmp_path_factory.mktemp("null_gpu") / "libnull_gpu.so"
     source = SUPPORT / "null_gpu.c"
     subprocess.run([compiler, "-O1", "-fPIC", "-shared", "-fvisibility=hidden", source, "-o", library], check=True)
-    return {"DRJIT_LIBCUDA_PATH": str(library), "DRJIT_LIBOPTIX_PATH": str(library)}
+    cache = str(tmp_path_factory.mktemp("cache"))  # its kernels are none
+    return {"DRJIT_LIBCUDA_PATH": str(library), "DRJIT_LIBOPTIX_PATH": str(library), "DRJIT_CACHE_DIR": cache}
 
 
 def hold(run_python: Callable[..., Any], null_gpu: dict[str, str | None], names: tuple[str, ...]) -> None:

@@ -115,7 +115,7 @@ class Setup(Objective):
 def measure(config: Config, full: bool = False, boundary: str = "all", part: int = 1) -> Found:
     """Errors of pathreplay's picture, forward and reverse derivative.
 
-    References have one ``part`` of their samples: their noise counts as errors, which are allowed no more for that.
+    References use 1/``part`` of their samples. Their noise adds to the errors; the limits stay the same.
     """
     size = config.res if full else min(SMALL, config.res)
     setup = Setup(config, size)

@@ -31,7 +31,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("hair.xml").write_text(SCENE)
 
 
-@pytest.mark.slow  # the other test has their gradients in quick tests
+@pytest.mark.slow  # a quick test optimises them
 def test_its_pigments_can_be_checked() -> None:
     (result,) = check_all(load_scene("hair.xml"), [KEY], seeds=2, spp=4, max_depth=2)
     assert result.key == KEY and result.gradient < 0

@@ -118,9 +118,10 @@ OPTICS = {
     "a mirror at a large angle": Optics(1.0, 2.0, mirror_angle=45.0, receiver_width=0.8),
     "a mirror and a point light": Optics(0.8, 1.2, mirror_angle=25.0, receiver_width=1.0, source_distance=1.5),
 }
+#: Rows and columns of cells.
+SIZES = {"smooth": (48, 64), "photograph": (72, 96)}
 #: Least correlation with the picture in cells of the surface, and in pixels of four by four cells; the error of the
 #: latter relative to that of a flat surface, whose image is even.
-SIZES = {"smooth": (48, 64), "photograph": (72, 96)}
 LEAST = {"smooth": (0.97, 0.999, 0.06), "photograph": (0.9, 0.985, 0.15)}
 
 
