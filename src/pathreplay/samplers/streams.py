@@ -58,7 +58,7 @@ class Stream(IntEnum):
     # The value is the index of an independent set of Sobol samples of a pixel (`Pass.sobol_sampler`). The interior term
     # uses set 0. The function `pixel_sweep` uses the first `pixel_samples.SETS` sets.
     FLOW = 0x10  # paths for the gradient term `FilmMotion` (`integrators.film.motion`)
-    FLOW_MEAN = 0x11  # paths that estimate the mean radiance, which `FilmMotion` subtracts
+    FLOW_MEAN = 0x11  # paths that estimate a typical radiance, which `FilmMotion` subtracts
     # The seed of the stream is a hash of the value and the seed of the image.
     SECOND_IMAGE = 0x2B5AD2C7  # a second, independent image of one view
     SECOND_HALF = 0x5E1C93A7  # the second half of the samples of one view

@@ -67,10 +67,9 @@ def integrator_under_test(
         limits = None if own is None else read_limits(own)
         name = spec or _own_name(own, bool(boundary))
         options = {} if own is None or name not in _OURS else stateful(own).options()
-        copied = {} if limits is None else vars(limits)
-        if limits is not None and name in _OURS and not options:
-            copied = without_unbounded(limits)
-        description = {"type": name, **copied}
+        description = {"type": name}
+        if limits is not None:
+            description |= without_unbounded(limits) if name in _OURS and not options else vars(limits)
         if name == PARTICLES:
             options.pop("caustics", None)
         kept = ("boundary", "boundary_spp", "caustics") if spec else tuple(options)

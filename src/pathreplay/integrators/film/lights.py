@@ -100,7 +100,7 @@ def _emitters_on_film(
 
 
 def _horizon_on_film(sky: mi.Emitter, sensor: mi.Sensor, sample: Sample) -> tuple[mi.Point2f, mi.Bool, mi.Bool]:
-    """Project points of the horizon of a `sunsky` onto the film, as `_emitters_on_film` projects points of emitters."""
+    """Project points on the horizon of a `sunsky` onto the film. The results are those of `_emitters_on_film`."""
     i, origins = dr.arange(mi.UInt32, HORIZON), sample.ray(sensor)[0].o
     sin, cos = dr.sincos(dr.two_pi / HORIZON * mi.Float(i))
     d = mi.traverse(sky)["to_world"] @ mi.Vector3f(cos, sin, 0)

@@ -88,8 +88,7 @@ class Traits:
     blended_mirrors: bool  # some blend contains lobes of delta reflection or transmission
     narrow: bool  # some surface may have a narrow smooth lobe
     glossy: bool  # `narrow` is True, and there is no checkerboard, whose seams boundary terms do not cover
-    outlines: bool  # a surface point may see the outline of a shape or emitter, a texture seam, or the sun or horizon
-    # of a sunsky
+    outlines: bool  # a surface point may see an outline, a texture seam, or the sun or horizon of a `sunsky`
     tables: Tables = None  # type: ignore[assignment]  # for the current pass, like all fields below
     coarse_meshes: bool = False  # some smooth-shaded mesh is coarse: see `facets`
     brushed_meshes: tuple[mi.Shape, ...] = ()  # meshes whose triangles all count as edges: see `Facets.brushed`
