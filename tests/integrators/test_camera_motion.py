@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from edge_ordinary import (
+    FEW,
     LENS,
     PAINT,
     UPRIGHT,
@@ -151,7 +152,7 @@ def test_the_gradient_is_that_of_any_flow(tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("name", ["point", pytest.param("gaussian", marks=pytest.mark.slow)])
 def test_noise_is_below_that_of_a_difference(name: str, tmp_path: Path) -> None:
-    hold_quiet(PLACES[name](tmp_path), tmp_path, passes=8, most=0.5)
+    hold_quiet(PLACES[name](tmp_path), tmp_path, **FEW)
 
 
 def around(light: dict) -> Write:
@@ -166,7 +167,7 @@ def around(light: dict) -> Write:
 )
 def test_noise_is_low_around_a_thing_before_a_background(light: dict, tmp_path: Path) -> None:
     """The background has no edges, so that only the distance of the thing counts."""
-    hold_quiet(around(light)(tmp_path), tmp_path, *((8, 32, 0.5) if light["type"] != "constant" else ()))
+    hold_quiet(around(light)(tmp_path), tmp_path, **({} if light["type"] == "constant" else FEW))
 
 
 def test_on_a_large_film_neighbours_cancel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,7 +100,7 @@ SCENES = {
 
 
 def gradients(folder: Path, name: str, passes: int = PASSES, spp: int = 32, **options: str) -> np.ndarray:
-    """The gradient of each of so many passes."""
+    """Return one gradient per pass."""
     make, key, move = SCENES[name]
     bench = Bench(Case(name, lambda: make(folder), key, move, spp=spp))
     found = bench.backwards(bench.integrator(**options), passes)

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from edge_ordinary import PAINT, Moving, T, film, grey, hold_quiet, loaded, measured, painted, panel, sensor
+from edge_ordinary import FEW, PAINT, Moving, T, film, grey, hold_quiet, loaded, measured, painted, panel, sensor
 from edge_truth import hold_agreement
 from pathreplay.integrators import integrator as integrators
 from pathreplay.integrators.camera_pass import Pass
@@ -154,13 +154,13 @@ def test_the_gradient_is_that_without_a_flow(name: str, tmp_path: Path, monkeypa
 
 
 def test_noise_is_below_that_of_a_difference(tmp_path: Path) -> None:
-    hold_quiet(CELLS[QUICK](tmp_path), tmp_path, passes=8, most=0.5)
+    hold_quiet(CELLS[QUICK](tmp_path), tmp_path, **FEW)
 
 
 @pytest.mark.parametrize("name", [n if n == QUICK_LIT else pytest.param(n, marks=pytest.mark.slow) for n in LIT])
 def test_a_static_light_in_the_view_makes_no_noise(name: str, tmp_path: Path) -> None:
     """If film positions moved across the light, two large terms would cancel only on average."""
-    hold_quiet(LIT[name](tmp_path), tmp_path, *((8, 32, 0.5) if name == QUICK_LIT else ()))
+    hold_quiet(LIT[name](tmp_path), tmp_path, **(FEW if name == QUICK_LIT else {}))
 
 
 def test_gradients_of_a_light_bring_no_noise_back(tmp_path: Path) -> None:

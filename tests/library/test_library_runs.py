@@ -239,11 +239,11 @@ def test_a_signal_ends_a_silent_run_with_a_line(photos: list[np.ndarray], capfd:
     assert "SIGTERM: stopping after this iteration" in capfd.readouterr().out
 
 
-def test_scenes_one_after_the_other_leave_nothing_behind() -> None:
+def test_ten_scenes_one_after_the_other_leave_nothing_behind() -> None:
     """Each in a folder; recordings, locks and threads of one are not in the way of the next."""
     threads, handlers = dr.thread_count(), signal.getsignal(signal.SIGINT)
-    for n in range(5):
-        colour = [0.1 + 0.16 * n, 0.5, 0.3]
+    for n in range(10):
+        colour = [0.1 + 0.08 * n, 0.5, 0.3]
         scene = room()
         scene["wall"]["bsdf"]["reflectance"]["value"] = colour
         target = np.array(mi.render(mi.load_dict(scene), sensor=0, spp=64))
@@ -251,7 +251,7 @@ def test_scenes_one_after_the_other_leave_nothing_behind() -> None:
         result = run(problem, output=f"runs/{n}", steps=10)
         assert result.history[-1].loss < 0.5 * result.history[0].loss
         assert np.abs(result.values[WALL] - colour).max() < 0.2, n
-    assert len(list(Path("runs").iterdir())) == 5
+    assert len(list(Path("runs").iterdir())) == 10
     assert (dr.thread_count(), signal.getsignal(signal.SIGINT)) == (threads, handlers)
     assert result.render(view="left", spp=4).shape == (SIDE, SIDE, 3)
 

@@ -95,10 +95,14 @@ def measured(moving: Moving, folder: Path, seeds: int = 8, **options: Any) -> Me
     return Measured(g, np.array([objective.dot(image) for image in differences]), transpose)
 
 
+#: For quick tests of noise far below the limit: few passes, and a lower limit instead.
+FEW: dict[str, Any] = {"passes": 8, "most": 0.5}
+
+
 def hold_quiet(moving: Moving, folder: Path, passes: int = 24, spp: int = 32, most: float = 1.0) -> None:
     """The noise of a gradient to be below that of a difference, whose pictures have as many samples each.
 
-    With few ``passes``, the ratio of the variances is to be at most ``most``.
+    The ratio of the two variances has to be below ``most``.
     """
     objective = loaded(moving, folder)
     ours = mi.load_dict({"type": "pathreplay", "max_depth": moving.depth})

@@ -100,7 +100,10 @@ def _emitters_on_film(
 
 
 def _horizon_on_film(sky: mi.Emitter, sensor: mi.Sensor, sample: Sample) -> tuple[mi.Point2f, mi.Bool, mi.Bool]:
-    """Project points on the horizon of a `sunsky` onto the film. The results are those of `_emitters_on_film`."""
+    """Project points on the horizon of a `sunsky` onto the film.
+
+    Returns positions and two masks, as `_emitters_on_film` does. All points on the film count as bright.
+    """
     i, origins = dr.arange(mi.UInt32, HORIZON), sample.ray(sensor)[0].o
     sin, cos = dr.sincos(dr.two_pi / HORIZON * mi.Float(i))
     d = mi.traverse(sky)["to_world"] @ mi.Vector3f(cos, sin, 0)
