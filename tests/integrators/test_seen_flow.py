@@ -195,7 +195,7 @@ def test_a_sun_in_the_view_does_not_move_with_what_is_near(mover: str, scale: fl
 HORIZON = {"type": "sunsky", "to_world": T().rotate([1, 0, 0], -90), "sun_scale": 0.0}
 
 
-#: Below the far edge of it, a band of the film is black that is narrower than the distance of probe rays.
+#: Below the far edge of it, a narrow band of the film is black.
 GROUND = {
     "type": "rectangle",
     "to_world": T().translate([0, -1.5, -10]).rotate([1, 0, 0], -90).scale(90),
@@ -213,21 +213,24 @@ def under(sky: dict, bsdf: dict, mover: str, **more: dict) -> Objective:
 
 
 @pytest.mark.parametrize(
-    ("bsdf", "mover", "tilt", "more"),
+    ("bsdf", "mover", "tilt", "more", "depth", "passes"),
     [
-        (PAINT, "body", 0, {}),
-        (PAINT, "camera", 25, {}),
-        ({"type": "roughconductor", "alpha": 0.1}, "body", 0, {}),
-        (PAINT, "body", 0, {"ground": GROUND}),
+        (PAINT, "body", 0, {}, 2, 8),
+        (PAINT, "camera", 25, {}, 2, 8),
+        ({"type": "roughconductor", "alpha": 0.1}, "body", 0, {}, 2, 8),
+        (PAINT, "body", 0, {"ground": GROUND}, 2, 8),
+        ({"type": "conductor"}, "body", 25, {"ground": GROUND}, 2, 8),
+        pytest.param({"type": "conductor"}, "camera", 0, {}, 2, 8, marks=pytest.mark.slow),
+        pytest.param({"type": "dielectric"}, "body", 0, {}, 3, 32, marks=pytest.mark.slow),
     ],
-    ids=["ball", "camera", "glossy", "ground"],
+    ids=["ball", "camera", "glossy", "ground", "mirror", "camera before a mirror", "glass"],
 )
-def test_a_horizon_stays_where_it_is(bsdf: dict, mover: str, tilt: float, more: dict) -> None:
-    """A sunsky is black below its horizon, and no surface has an edge there."""
+def test_a_horizon_is_an_edge(bsdf: dict, mover: str, tilt: float, more: dict, depth: int, passes: int) -> None:
+    """A sunsky is black below its horizon, which is seen directly, in a mirror or in glass. No surface ends there."""
     place = T().rotate([0, 0, 1], tilt) @ HORIZON["to_world"]
     objective = under({**HORIZON, "to_world": place}, bsdf, mover, **more)
-    ours, plain = (mi.load_dict({"type": name, "max_depth": 2}) for name in ("pathreplay", "path"))
-    g = np.array([objective.backward(ours, seed, 64) for seed in range(8)])
+    ours, plain = (mi.load_dict({"type": name, "max_depth": depth}) for name in ("pathreplay", "path"))
+    g = np.array([objective.backward(ours, seed, 64) for seed in range(passes)])
     d = np.array([objective.dot(objective.difference(plain, CENTRAL, 0.02, 100 + s, 512)) for s in range(8)])
     objective.put(dr.opaque(mi.Float, 0))
     found = gap(g, d)

@@ -21,7 +21,7 @@ from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import is_one_of, may_move, may_turn
 from pathreplay.transport.path import PathState
-from pathreplay.transport.signature import mixed, place_met, shape_met, turned_away
+from pathreplay.transport.signature import horizon_gap, mixed, place_met, shape_met, turned_away
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.surface import steady
 from pathreplay.transport.vertex import Arrival, TraceConfig, VertexSamples
@@ -102,8 +102,11 @@ def _probe_vertex(trace: TraceConfig, path: PathState, key: mi.UInt32, active: m
     si = at.hit.compute_surface_interaction(at.ray, flags, active)
     if not traits.copies:
         si.shape = at.hit.shape
-    away = dr.select(turned_away(si, at.ray.d), mi.UInt32(1), 0)
-    probe = VisibilityProbe(mixed(place_met(trace, at.hit, active, si.shape), away), si.p, si.n)
+    away = turned_away(si, at.ray.d)
+    if traits.sunsky is not None:
+        away |= ~at.hit.is_valid() & (horizon_gap(traits.sunsky, at.ray.d) < 0)
+    signature = mixed(place_met(trace, at.hit, active, si.shape), dr.select(away, mi.UInt32(1), 0))
+    probe = VisibilityProbe(signature, si.p, si.n)
     if not (traits.coarse_meshes or traits.brushed_meshes):
         return probe
     triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)

@@ -1,8 +1,9 @@
 """Creases: edges at which no surface occludes another.
 
-There are three kinds of creases. At a contact, two surfaces meet. The second kind is the boundary of a hard shadow. The
+There are four kinds of creases. At a contact, two surfaces meet. The second kind is the boundary of a hard shadow. The
 third is a line at which a smooth-shaded mesh turns black, because its shading normal becomes perpendicular to the ray.
-This line lies slightly inside the outline of the mesh.
+This line lies slightly inside the outline of the mesh. The fourth is the horizon of a `sunsky`, below which it is
+black.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathreplay.boundary.crofton import at_an_angle, hides_itself
 from pathreplay.boundary.hard_shadows import HardShadow
 from pathreplay.platform import compat
 from pathreplay.transport.meet import meet
-from pathreplay.transport.signature import place_met, shape_met, turned_away
+from pathreplay.transport.signature import horizon_gap, place_met, shape_met, turned_away
 from pathreplay.transport.vertex import Arrival, TraceConfig
 
 MEETS = 1e-3
@@ -34,19 +35,21 @@ Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
 
 @dataclass
 class Crease:
-    """The crease between the hits of two rays. It is of one of the three kinds that the module describes."""
+    """The crease between the hits of two rays. It is of one of the four kinds that the module describes."""
 
     a: mi.PreliminaryIntersection3f
     b: mi.PreliminaryIntersection3f
     meets: mi.Bool  # two surfaces are in contact, at an angle
     turns: mi.Bool  # the hits are on one sheet, and only one of their shading normals faces the ray
     shadow: HardShadow | None  # None if no vertex is tested for hard shadows
+    sky: mi.Bool  # both rays miss all surfaces
+    sunsky: mi.Emitter | None
 
     @staticmethod
     def of(trace: TraceConfig, side_a: Side, side_b: Side, shadow: HardShadow | None, active: mi.Bool) -> Crease:
         """Classify the edge between two hits. The result is detached."""
         (a, ray_a), (b, ray_b) = side_a, side_b
-        both = active & a.is_valid() & b.is_valid()
+        both, sky = active & a.is_valid() & b.is_valid(), active & ~a.is_valid() & ~b.is_valid()
         if shadow is not None:
             both &= ~shadow.exists
         flags = compat.shading_frame()
@@ -54,12 +57,13 @@ class Crease:
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
         same = both & (place_met(trace, a, both, si_a.shape) == place_met(trace, b, both, si_b.shape))
         turns = same & (turned_away(si_a, ray_a.d) != turned_away(si_b, ray_b.d)) & ~hides_itself(si_a, si_b)
-        return Crease(a, b, meets, turns, shadow)
+        sunsky = trace.traits.sunsky
+        return Crease(a, b, meets, turns, shadow, mi.Bool(False) if sunsky is None else sky, sunsky)
 
     @property
     def exists(self) -> mi.Bool:
         """Whether a crease lies between the two hits."""
-        exists = self.meets | self.turns
+        exists = self.meets | self.turns | self.sky
         return exists if self.shadow is None else exists | self.shadow.exists
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
@@ -71,6 +75,8 @@ class Crease:
         t = [hit.compute_surface_interaction(ray, compat.shading(), meets).t for hit in (self.a, self.b)]
         si = self.a.compute_surface_interaction(ray, compat.shading(), turns)
         B = dr.select(meets, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), 0))
+        if self.sunsky is not None:
+            B = dr.select(active & self.sky, horizon_gap(self.sunsky, ray.d), B)
         return B if self.shadow is None else dr.select(self.shadow.exists, self.shadow.gap(ray, active), B)
 
 

@@ -15,6 +15,7 @@ function B depends on the kind of edge:
 - Contact of two surfaces: B is the difference of the distances of the two surfaces along the ray.
 - Smooth-shaded mesh: B is the dot product of the ray direction and the shading normal. B vanishes slightly before the
   outline of the mesh. Between this line and the outline, the mesh is black.
+- Horizon of a `sunsky`: B is the height of the ray direction above the horizon.
 - Boundary of a hard shadow: B = n·(x + r d - z). The visible point x slides with the path. The light lies in the
   direction d from x, and z is the point of the occluder in this direction, at distance r from x.
 
@@ -94,7 +95,7 @@ class FilmCrossing:
     active: mi.Bool
 
     def gap(self, at: mi.Ray3f) -> mi.Float:
-        outline = outline_gap(self.n, at.o, at.d, self.near.hit, at, self.active)
+        outline = outline_gap(self.n, at.o, at.d, self.near.hit, at, self.active & ~self.crease.exists)
         return dr.select(self.crease.exists, self.crease.gap(at, self.active), outline)
 
 
@@ -138,9 +139,9 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         jump = weight * split.β * T * self.jump(sides, key)
 
         near, s = dr.select(near_a, split.a, split.b), dr.select(near_a, *ends)
-        active = active & near.hit.is_valid()
-        n = edge_normal(near.hit, near.ray, active)
         crease = Crease.of(self.chain, (split.a.hit, split.a.ray), (split.b.hit, split.b.ray), shadow, active)
+        active = active & (near.hit.is_valid() | crease.sky)
+        n = edge_normal(near.hit, near.ray, active & ~crease.sky)
         path, active = record_chain(self.chain, s, self.film.ray(s, key)[0], key, split.k, near.ray, active)
         return Edges(path, [FilmCrossing(dr.select(active, jump, 0), near, n, crease, sides, active)], None)
 
@@ -153,6 +154,7 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         (a, b), T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:
             t = SHORT_OF * dr.minimum(split.a.hit.t, split.b.hit.t)
+            t = dr.select(dr.isfinite(t), t, 0)  # at the horizon of a `sunsky`, neither ray hits a surface
             medium = self.film.medium(trace, ray, active)
             T, medium = transmittance_of_chain(trace, ray, medium, key, split.k, t, active)
             active = active & dr.any(T != 0)

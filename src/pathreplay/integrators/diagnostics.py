@@ -11,7 +11,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.edge_notes import edges_note, keys_that_move_edges
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.platform import compat
-from pathreplay.transport.facts.traits import SUNSKY, is_specular
+from pathreplay.transport.facts.traits import is_specular
 from pathreplay.transport.vertex import TraceConfig
 
 COST_OF_EDGES = (
@@ -115,21 +115,13 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
 
 
 def sun_note(trace: TraceConfig) -> str:
-    """Format the message about the edges of a `sunsky` in a scene with mirrors or glass; "" without such edges."""
-    if not any(map(is_specular, trace.traits.mirrors)):
+    """Format the message about the sun of a `sunsky` in a scene with mirrors or glass; "" without such a sun."""
+    sky = trace.traits.sunsky
+    if sky is None or not mi.traverse(sky)["sun_scale"] > 0 or not any(map(is_specular, trace.traits.mirrors)):
         return ""
-    skies = [mi.traverse(light) for light in trace.scene.emitters() if light.class_name() == SUNSKY]
-    scales = {
-        "sky_scale": ("of the sky's horizon", "an envmap"),
-        "sun_scale": ("of the edge of the sun's disc", "a directional emitter and sun_scale = 0"),
-    }
-    found = [words for scale, words in scales.items() if any(sky[scale] > 0 for sky in skies)]
-    if not found:
-        return ""
-    edges, remedies = (" and ".join(words) for words in zip(*found, strict=True))
     return (
-        f"something moves in a scene with delta lobes and a sunsky: the motion {edges}, as seen through glass or "
-        f"mirrors, is missing from the gradient; use {remedies}"
+        "something moves in a scene with delta lobes and a sunsky: the motion of the edge of the sun's disc, as seen "
+        "through glass or mirrors, is missing from the gradient; use a directional emitter and sun_scale = 0"
     )
 
 

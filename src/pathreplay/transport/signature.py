@@ -62,6 +62,14 @@ def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
     return si.shape.is_mesh() & (dr.dot(si.sh_frame.n, d) > 0)
 
 
+def horizon_gap(sunsky: mi.Emitter, d: mi.Vector3f) -> mi.Float:
+    """Return the height of a direction above the horizon of a `sunsky`, which is black where the result is negative.
+
+    Differentiable in ``d``.
+    """
+    return dr.dot(dr.detach(sunsky.world_transform()) @ mi.Vector3f(0, 0, 1), d)
+
+
 def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
     """Compute the unit vector perpendicular to the ray and to an edge near the hit. Detached.
 

@@ -2,9 +2,8 @@
 
 If film positions moved across a static light, the motion of its edge and of its whole radiance would have to be
 sampled. Both terms are large, and they cancel only on average. In the disc of the sun of a `sunsky`, the first term
-would even be missing, because the edge of the disc is not the edge of a surface. The same is true at the horizon of a
-`sunsky`, below which its radiance is zero. A film flow is therefore zero near static lights, and contains no parallax
-near bright parts of the sky and near this horizon.
+would even be missing, because the edge of the disc is not the edge of a surface. A film flow is therefore zero near
+static lights, and contains no parallax near bright parts of the sky.
 """
 
 from __future__ import annotations
@@ -18,14 +17,11 @@ from pathreplay.integrators.film.grid import CELLS, REACH, distance_to
 from pathreplay.integrators.film.sample import ORTHOGRAPHIC, Sample, film_velocity, probes_of, ray_derivatives
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
-from pathreplay.transport.facts.traits import SUNSKY
 
 BRIGHT = 2.0
 """Density per steradian of an emitter's samples above which a part of the sky is bright; uniform samples have 0.08."""
 MOST = 8
 """Largest number of sampled points of emitters, relative to the number of probe rays."""
-HORIZON = 4096
-"""Number of points on the horizon of a `sunsky`, of which those in the view are projected onto the film."""
 AWAY = 1.5 / CELLS
 """Distance from a light, in film widths, up to which a flow is zero. It exceeds the diagonal of a cell of the grid."""
 
@@ -36,7 +32,7 @@ class SeenLights:
 
     position: mi.Point2f
     hit: mi.PreliminaryIntersection3f  # what the camera sees at the position
-    sky: mi.Bool  # a bright part of the sky or the horizon of a `sunsky` is visible
+    sky: mi.Bool  # a bright part of the sky is visible
     shape: mi.Bool  # a shape that emits light towards the camera is visible
 
     @staticmethod
@@ -49,7 +45,6 @@ class SeenLights:
             everywhere, none = dr.full(mi.Bool, True, probes), dr.full(mi.Bool, False, probes)
             parts = [(sample.position, everywhere, none)]
             parts.append(_emitters_on_film(scene, sensor, sample, max(per_probe, 1) * probes))
-            parts += [_horizon_on_film(sky, sensor, sample) for sky in scene.emitters() if sky.class_name() == SUNSKY]
             positions, insides, brights = zip(*parts, strict=True)
             position = mi.Point2f(*(dr.concat([part[k] for part in positions]) for k in (0, 1)))
             inside, bright = dr.concat(list(insides)), dr.concat(list(brights))
@@ -97,22 +92,6 @@ def _emitters_on_film(
     p = dr.select(sky, _point_of_sky(sensor, origin.p, light.d), light.p)
     position, inside = _projected(sensor, p)
     return position, extended & inside, sky & (light.pdf > BRIGHT)
-
-
-def _horizon_on_film(sky: mi.Emitter, sensor: mi.Sensor, sample: Sample) -> tuple[mi.Point2f, mi.Bool, mi.Bool]:
-    """Project points on the horizon of a `sunsky` onto the film.
-
-    Returns positions and two masks, as `_emitters_on_film` does. All points on the film count as bright.
-    """
-    i, origins = dr.arange(mi.UInt32, HORIZON), sample.ray(sensor)[0].o
-    sin, cos = dr.sincos(dr.two_pi / HORIZON * mi.Float(i))
-    d = mi.traverse(sky)["to_world"] @ mi.Vector3f(cos, sin, 0)
-    yes = dr.full(mi.Bool, True, HORIZON)
-    if sensor.class_name() == ORTHOGRAPHIC:  # all rays see the same point of the sky
-        return dr.zeros(mi.Point2f, HORIZON), ~yes, yes
-    origin = dr.gather(mi.Point3f, origins, i % dr.width(origins))
-    position, inside = _projected(sensor, _point_of_sky(sensor, origin, dr.normalize(d)))
-    return position, inside & yes, yes
 
 
 def _point_of_sky(sensor: mi.Sensor, origin: mi.Point3f, d: mi.Vector3f) -> mi.Point3f:

@@ -75,6 +75,7 @@ class Traits:
     hard_lights: bool  # some emitter casts hard shadows
     projectors: tuple[mi.Emitter, ...]  # projectors: the illuminated region has a hard boundary
     spots: tuple[mi.Emitter, ...]  # spot lights: their cone has a hard boundary if beam_width >= cutoff_angle
+    sunsky: mi.Emitter | None  # the environment, if it is a `sunsky`: it is black below its horizon
     directed_areas: bool  # some emitter is a `directionalarea`, which camera paths do not find
     broken_lights: bool  # the samples of some emitter are discontinuous: see `_bounding_sphere`
     sphere_lights: bool  # some sphere emits
@@ -129,6 +130,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         projectors=tuple(light for light in scene.emitters() if light.class_name() == PROJECTOR),
         spots=tuple(light for light in scene.emitters() if light.class_name() == SPOT),
+        sunsky=next((light for light in scene.emitters() if light.class_name() == SUNSKY), None),
         directed_areas=any(light.class_name() == DIRECTED_AREA for light in scene.emitters()),
         broken_lights=any(_bounding_sphere(shape)[3] > 0 for shape in shapes if shape.is_emitter()),
         sphere_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
