@@ -144,7 +144,7 @@ def check(
         Path | None, typer.Option(help="Also draw derivative images beside finite differences (PNG, PDF or SVG).")
     ] = None,
 ) -> None:
-    """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if a check fails."""
+    """Compare gradients with finite differences of images; exit status 1 if a check fails."""
     with interrupts.undisturbed():  # signals must not interrupt imports; see `optimize`
         from pathreplay.platform import backend
         from pathreplay.platform.atomic_files import require_writable, write_whole

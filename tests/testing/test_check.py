@@ -23,7 +23,7 @@ from pathreplay.platform import progress_bar
 from pathreplay.scenes.parameters import get_array
 from pathreplay.testing import check_gradient, command
 from pathreplay.testing.direction import choose_line
-from pathreplay.testing.objective import smooth_weights
+from pathreplay.testing.objective import integrator_name, smooth_weights
 from pathreplay.testing.reference import integrator_under_test, read_limits, reference_integrator
 from pathreplay.testing.statistics import gap, normal
 from pathreplay.testing.stencil import BACKWARD, CENTRAL, FORWARD, UPWARD, WIDE, Stencil
@@ -208,6 +208,15 @@ def test_the_reference_has_the_limits_of_the_integrator(kind: str, limits: tuple
     assert again is not None and (again.max_depth, again.hide_emitters) == (max_depth, hide)
     # Roulette stays only where paths have no end without it.
     assert (again.rr_depth == rr_depth) == (max_depth == -1)
+
+
+@pytest.mark.parametrize("kind", ["pathreplay_particles", "pathreplay", "ptracer"])
+def test_the_reference_of_light_paths_has_their_caustics(kind: str) -> None:
+    options = {"caustics": "particles"} if kind == "pathreplay" else {}
+    tested = mi.load_dict({"type": kind, "max_depth": 4, **options})
+    reference = reference_integrator(None, mi.load_dict({"type": "scene"}), tested)
+    assert integrator_name(reference) == integrator_name(tested) == kind
+    assert stateful(reference).options()["caustics"] == "particles" and read_limits(reference).max_depth == 4  # type: ignore[union-attr]
 
 
 def test_choice_of_integrators() -> None:

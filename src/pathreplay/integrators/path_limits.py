@@ -1,4 +1,4 @@
-"""Read the path length, the depth of Russian roulette and the visibility of emitters from any integrator."""
+"""Read the path limits of any integrator, and describe the integrator that renders its image for comparison."""
 
 from __future__ import annotations
 
@@ -10,10 +10,15 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.integrators.path_integrator import UNBOUNDED
+from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.integrators.stateful import stateful
 from pathreplay.transport.facts.nodes import nodes_of
+from pathreplay.types import Json
 
 DIRECT, DIRECT_DEPTH = "DirectIntegrator", 2
 """Class of an integrator without the property ``max_depth``, and the length of its paths."""
+LIGHT_PATHS = {"ParticleIntegrator": "pathreplay_particles", "ParticleTracerIntegrator": "ptracer"}
+"""Plugins that trace all light from the emitters, by class."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,22 @@ def read_limits(integrator: mi.Integrator) -> Limits | None:
     depth = _whole(max_depth)  # Mitsuba's Python integrators store -1 as UNBOUNDED
     hides = bool(getattr(integrator, "hide_emitters", False))
     return Limits(-1 if depth >= UNBOUNDED else depth, _whole(rr_depth), hides)
+
+
+def counterpart(integrator: mi.Integrator, scene: mi.Scene) -> Json | None:
+    """Describe the integrator whose images have the same expectation; None if the path length cannot be read.
+
+    It is Mitsuba's `path`, or `volpath` with media. These find no caustic of a light without extent, and `ptracer`
+    leaves out media, and light at the border of the film. Integrators with light paths are therefore their own
+    counterparts.
+    """
+    limits = read_limits(integrator)
+    if limits is None:
+        return None
+    if stateful(integrator).options().get("caustics") != "particles":
+        return {"type": "volpath" if facts_of(scene).has_media else "path", **vars(limits)}
+    name = LIGHT_PATHS.get(type(integrator).__name__, LIGHT_PATHS.get(integrator.class_name()))
+    return {"type": name, **vars(limits)} if name else {"type": "pathreplay", "caustics": "particles", **vars(limits)}
 
 
 def without_unbounded(limits: Limits) -> dict[str, int]:

@@ -20,6 +20,8 @@ _RECORDABLE = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
 """Classes of Mitsuba's integrators that `dr.freeze` can record."""
 _PROJECTIVE = "Projective"
 """Substring in the class names of Mitsuba's integrators that estimate boundary terms."""
+_PTRACER = "ParticleTracerIntegrator"
+"""Class of Mitsuba's `ptracer`."""
 
 
 @runtime_checkable
@@ -123,6 +125,9 @@ class Stateless(Unlearned):
 
     def silence(self, notes: Iterable[str]) -> None:
         """Do nothing, since no notes are logged."""
+
+    def options(self) -> Json:
+        return {"caustics": "particles"} if self.integrator.class_name() == _PTRACER else {}
 
     def is_recordable(self, has_media: bool) -> bool:
         return self._kind in _RECORDABLE and not has_media

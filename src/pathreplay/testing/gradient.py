@@ -1,4 +1,4 @@
-"""Gradient checks: the derivative of any integrator against finite differences of a plain path tracer.
+"""Gradient checks: the derivative of any integrator against finite differences of images by a plain path tracer.
 
 Each check draws two sets of independent samples of one directional derivative, and derives standard errors and a
 verdict from them.

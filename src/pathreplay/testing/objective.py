@@ -204,5 +204,6 @@ def integrator_name(integrator: mi.Integrator) -> str:
     # For Python plugins Mitsuba's class_name() returns the name of the C++ base class.
     name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     name = name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()
+    name = {"particle": "pathreplay_particles", "particletracer": "ptracer"}.get(name, name)
     edges = stateful(integrator).options().get("boundary", "auto")
     return name if edges == "auto" else f"{name}, boundary {edges}"

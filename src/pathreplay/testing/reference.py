@@ -1,4 +1,4 @@
-"""The two integrators of a check: the integrator under test, and the plain path tracer used as its reference.
+"""The two integrators of a check: the integrator under test, and the integrator used as its reference.
 
 The reference must estimate the same image as the integrator under test. Both therefore need the same path length, and
 must treat directly visible emitters alike. These settings are read from the integrator under test.
@@ -12,8 +12,7 @@ from typing import TypeAlias
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.integrators.path_limits import read_limits, without_unbounded
-from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.integrators.path_limits import counterpart, read_limits, without_unbounded
 from pathreplay.integrators.stateful import stateful
 from pathreplay.scenes.descriptions import load_integrator
 
@@ -69,7 +68,7 @@ def integrator_under_test(
         options = {} if own is None or name not in _OURS else stateful(own).options()
         description = {"type": name}
         if limits is not None:
-            description |= without_unbounded(limits) if name in _OURS and not options else vars(limits)
+            description |= without_unbounded(limits) if name in _OURS and "adjoint" not in options else vars(limits)
         if name == PARTICLES:
             options.pop("caustics", None)
         kept = ("boundary", "boundary_spp", "caustics") if spec else tuple(options)
@@ -104,7 +103,7 @@ def _own_name(own: mi.Integrator | None, has_boundary: bool) -> str:
 
 
 def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> mi.Integrator:
-    """Return the integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
+    """Return the integrator whose images are differenced: ``spec`` if given, else the `counterpart` of ``tested``.
 
     Russian roulette is disabled if ``max_depth`` is bounded by `LONGEST_WITHOUT_ROULETTE`. The expected image does
     not change. With roulette, a path could end at +h and continue at -h. Roulette also cannot handle negative
@@ -116,13 +115,14 @@ def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> 
         return spec
     if isinstance(spec, Mapping):
         return load_integrator(dict(spec))
-    limits = read_limits(tested)
-    if limits is None:
+    plain = counterpart(tested, scene)
+    if plain is None:
         raise PathreplayError(
             f"Integrator {type(tested).__name__} does not expose its max_depth; pass a reference integrator that "
             "computes the same image, for example reference={'type': 'path', 'max_depth': 6}"
         )
-    short = 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE
-    name = spec or ("volpath" if facts_of(scene).has_media else "path")
-    rr_depth = NO_ROULETTE if short else limits.rr_depth
-    return load_integrator({"type": name, **vars(limits), "rr_depth": rr_depth})
+    if spec is not None:
+        plain = {"type": spec, **vars(read_limits(tested))}
+    if 0 <= plain["max_depth"] <= LONGEST_WITHOUT_ROULETTE:
+        plain["rr_depth"] = NO_ROULETTE
+    return load_integrator(plain)

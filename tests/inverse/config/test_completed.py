@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from pathreplay.integrators.path_limits import Limits, read_limits
+from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.problem.problem import Problem, build_problem
 from pathreplay.jobs import make_config
 from pathreplay.output.export import export_run
+from pathreplay.testing.objective import integrator_name
 
 # A lamp in view, between two walls that light each other: depth and hidden emitters both show.
 SCENE = """<scene version="3.0.0">
@@ -59,6 +61,15 @@ def test_a_job_without_integrator_has_the_depth_and_options_of_the_scenes() -> N
     assert (ours.boundary, ours.adjoint, read_limits(ours)) == ("primary", "replay", Limits(2, 5, True))
     assert read_limits(problem(integrator={"type": "pathreplay"}).integrator) == Limits(6, 5, False)
     assert read_limits(mi.load_dict({"type": "volprim_rf_basic", "max_depth": 9, "rr_depth": 7})) == Limits(9, 7, False)
+
+
+@pytest.mark.parametrize(("own", "given"), [("prb", {"type": "pathreplay_particles"}), ("ptracer", {})])
+def test_targets_of_light_paths_have_their_caustics(own: str, given: dict[str, str]) -> None:
+    """`path` finds no caustic of a light without extent: a target by `path` would be black there."""
+    found = problem(own, **({"integrator": given} if given else {}), sensors=["cam"])
+    assert stateful(found.integrator).options()["caustics"] == "particles"
+    assert integrator_name(found.judge) == integrator_name(found.integrator)
+    assert read_limits(found.judge) == read_limits(found.integrator)
 
 
 HIDDEN = '<boolean name="hide_emitters" value="true"/>'

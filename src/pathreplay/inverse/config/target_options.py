@@ -50,7 +50,8 @@ class Target(Table):
             raise ValueError(f"target: alpha = '{self.alpha}' applies to 'images' only; remove it, or give 'images'")
         elif not self.values and self.scene is None:
             raise ValueError(NOTHING)
-        if self.integrator is not None and self.integrator.type == "pathreplay":
+        light_paths = self.integrator is not None and (self.integrator.model_extra or {}).get("caustics") == "particles"
+        if self.integrator is not None and self.integrator.type == "pathreplay" and not light_paths:
             raise ValueError(
                 "target: integrator 'pathreplay' would be compared with itself; render targets with another "
                 "integrator, such as 'path'"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from pathreplay.integrators.path_limits import Limits, read_limits, without_unbounded
-from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.integrators.path_limits import Limits, counterpart, read_limits, without_unbounded
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.tables import Plugin
@@ -20,8 +19,7 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
     """Fill in the integrators that a job leaves out.
 
     The default integrator of a job is `pathreplay` with the options of the scene's integrator. The default integrator
-    of rendered targets is `path`, or `volpath` for scenes with media. The path limits (`Limits`) of this default are
-    copied from the job's integrator.
+    of rendered targets is the `counterpart` of the job's integrator.
 
     Args:
         config: the job.
@@ -38,12 +36,11 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
         config = config.model_copy(update={"integrator": Plugin(type="pathreplay", **options)})
     if config.brings_pictures:
         return config, ()
-    limits = read_limits(load_integrator(config.integrator.model_dump()) if own is None else own)
+    ours = load_integrator(config.integrator.model_dump()) if own is None else own
     asked = config.target.integrator
     if asked is not None:
-        return config, _differences(limits, read_limits(load_integrator(asked.model_dump())), config)
-    name = "volpath" if facts_of(scene).has_media else "path"
-    plugin = Plugin(type=name, **({"max_depth": 6} if limits is None else vars(limits)))
+        return config, _differences(read_limits(ours), read_limits(load_integrator(asked.model_dump())), config)
+    plugin = Plugin(**(counterpart(ours, scene) or {"type": "path", "max_depth": 6}))
     return config.model_copy(update={"target": config.target.model_copy(update={"integrator": plugin})}), ()
 
 
@@ -52,9 +49,8 @@ def _options(own: mi.Integrator | None) -> Json:
     limits = None if own is None else read_limits(own)
     if own is None or limits is None:
         return {}
-    if options := stateful(own).options():
-        return vars(limits) | options
-    return without_unbounded(limits)
+    options = stateful(own).options()
+    return (vars(limits) if "adjoint" in options else without_unbounded(limits)) | options
 
 
 def _differences(ours: Limits | None, theirs: Limits | None, config: Config) -> tuple[str, ...]:
