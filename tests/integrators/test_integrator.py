@@ -444,16 +444,26 @@ def test_a_moving_instance_is_refused() -> None:
 
 
 def test_nothing_moves_when_only_a_smooth_lobe_changes() -> None:
-    """The roughness of one thing must not make the path move because another is a mirror."""
+    """Roughness must not make the path move because another thing is a mirror, and relief not because of a mask."""
     from pathreplay.transport.motion import path_moves
     from pathreplay.transport.start import CameraStart
 
     description = lit_room({"type": "roughconductor", "alpha": 0.2})
-    description["mirror"] = {"type": "sphere", "center": [0, 0, -5], "bsdf": {"type": "conductor"}}
+    bumps = {"type": "normalmap", "normalmap": bitmap(noise(4, 3, 0.4, 0.6)), "bsdf": {"type": "conductor"}}
+    description["mirror"] = {"type": "sphere", "center": [0, 0, -5], "bsdf": bumps}
+    veins = {"type": "normalmap", "normalmap": bitmap(noise(4, 3, 0.4, 0.6)), "bsdf": {"type": "roughconductor"}}
+    description["leaf"] = {"type": "sphere", "bsdf": {"type": "mask", "opacity": 0.5, "bsdf": veins}}
     scene = mi.load_dict(description, optimize=False)
     params = mi.traverse(scene)
     ray, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
-    for key, moves in (("object.bsdf.alpha.value", False), ("object.to_world", True), ("sky.radiance.value", False)):
+    expected = {
+        "object.bsdf.alpha.value": False,
+        "object.to_world": True,
+        "sky.radiance.value": False,
+        "mirror.bsdf.normalmap.data": True,
+        "leaf.bsdf.nested_bsdf.normalmap.data": False,
+    }
+    for key, moves in expected.items():
         dr.enable_grad(params[key])
         params.update()
         trace = plugin()._trace_config(scene, None)

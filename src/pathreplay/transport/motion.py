@@ -113,11 +113,12 @@ def _depends(trace: TraceConfig, start: Start, at: Arrival, painted: bool) -> bo
         surface: list[dr.ArrayBase] = [si.p, si.n, si.sh_frame.n]
         if painted:
             surface += [si.uv, si.dp_du, si.dp_dv]
-        still = dr.detach(si)
-        mirrored = [
-            bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5), mi.Bool(True))[0].wo
-            for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ())
-        ]
+        still, delta, any_lobe = dr.detach(si), mi.BSDFContext(), mi.BSDFContext()
+        delta.type_mask = +mi.BSDFFlags.Delta  # a `mask` or `plastic` has smooth lobes, too, which are sampled detached
+        sampled = [(bsdf, delta) for bsdf in trace.traits.mirrors]
+        if trace.follows and painted:
+            sampled += [(bsdf, any_lobe) for bsdf in trace.traits.attachables]
+        mirrored = [bsdf.sample(ctx, still, 0.5, mi.Point2f(0.5), mi.Bool(True))[0].wo for bsdf, ctx in sampled]
         light, _ = trace.scene.sample_emitter_direction(still, mi.Point2f(0.5), False)
         return (
             dr.grad_enabled(*start.repeat(), *mirrored)
