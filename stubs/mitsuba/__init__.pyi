@@ -630,6 +630,7 @@ class MemoryStream(Stream):
 class BSDFContext:
     mode: TransportMode
     component: int
+    type_mask: int
     @overload
     def __init__(self, mode: TransportMode = ...) -> None: ...
     @overload

@@ -15,8 +15,19 @@ TRANSPOSE_MAX = 1e-5
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in CONFIGS])
 def test_errors_are_below_the_limits(name: str) -> None:
+    hold(name, part=8 if name in QUICK else 1)
+
+
+@pytest.mark.hours
+@pytest.mark.parametrize("seed", [3001, 6001])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_errors_are_below_the_limits_with_other_seeds(name: str, seed: int) -> None:
+    hold(name, seed=seed)
+
+
+def hold(name: str, **options: int) -> None:
     config = CONFIGS[name]
-    found = measure(config, boundary="all", part=8 if name in QUICK else 1)
+    found = measure(config, boundary="all", **options)
     told = row(name, found, config.limits)
     assert not found.misses(config.limits), told
     # The limits allow much where the image is mostly dark.

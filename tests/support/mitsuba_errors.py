@@ -112,8 +112,8 @@ class Setup(Objective):
         return np.array([picture(seed + k, spp // passes) for k in range(passes)])
 
 
-def measure(config: Config, full: bool = False, boundary: str = "all", part: int = 1) -> Found:
-    """Errors of pathreplay's picture, forward and reverse derivative.
+def measure(config: Config, full: bool = False, boundary: str = "all", part: int = 1, seed: int = 1) -> Found:
+    """Errors of pathreplay's picture, forward and reverse derivative, with seeds from ``seed`` on.
 
     References use 1/``part`` of their samples. Their noise adds to the errors; the limits stay the same.
     """
@@ -131,12 +131,12 @@ def measure(config: Config, full: bool = False, boundary: str = "all", part: int
 
     expected = setup.pictures(lambda seed, spp: setup.image(plain, seed, spp), reference_spp, 1000).mean(axis=0)
     slopes = setup.pictures(difference, reference_spp, 2000)
-    image = setup.pictures(lambda seed, spp: setup.image(ours, seed, spp), spp, 1).mean(axis=0)
-    tangents = setup.along(ours, places, 1, spp)
+    image = setup.pictures(lambda seed, spp: setup.image(ours, seed, spp), spp, seed).mean(axis=0)
+    tangents = setup.along(ours, places, seed, spp)
     slope, tangent = slopes.mean(axis=0), tangents.mean(axis=0)
 
     setup.weigh(np.full(image.shape, ADJOINT / image.size))
-    gradient, sum_of_slope = setup.backward(ours, 1, config.reverse_spp * wide**2), setup.dot(slope)
+    gradient, sum_of_slope = setup.backward(ours, seed, config.reverse_spp * wide**2), setup.dot(slope)
     reverse = abs(gradient - sum_of_slope) / max(abs(sum_of_slope), FLOOR_REVERSE)
 
     # Grey, since the weights take part in the choice of vertices; more at the right, or what moves would cancel.
@@ -145,8 +145,8 @@ def measure(config: Config, full: bool = False, boundary: str = "all", part: int
     ahead_sums, sums = (np.array([setup.dot(x) for x in samples]) for samples in (tangents, slopes))
     ahead_sums -= np.polyfit(places, ahead_sums, 1)[0] * places  # no noise, and its mean is zero
     z = gap(ahead_sums, sums).z
-    ahead, back = setup.forward(ours, 1, 16), setup.backward(ours, 1, 16)
-    scale = max(setup.dot(np.abs(ahead)), setup.magnitude(ours, 1, 16))
+    ahead, back = setup.forward(ours, seed, 16), setup.backward(ours, seed, 16)
+    scale = max(setup.dot(np.abs(ahead)), setup.magnitude(ours, seed, 16))
     transpose = abs(setup.dot(ahead) - back) / (scale or 1)
     setup.put(mi.Float(0))
     primal, forward = relative(image, expected, FLOOR_PRIMAL), relative(tangent, slope, FLOOR_FORWARD)
