@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -309,6 +310,35 @@ def test_a_direction_of_the_sun_of_another_length_comes_out(tmp_path: Path) -> N
     (tmp_path / "out").mkdir()
     write_files(found, tmp_path / "out")
     require_same(found.scene, tmp_path / "out")
+
+
+def brightest(scene: mi.Scene) -> np.ndarray:
+    """Of many directions, the one in which the environment is brightest."""
+    u, v = np.meshgrid(*2 * [(np.arange(500, dtype=np.float32) + 0.5) / 500])
+    directions = mi.warp.square_to_uniform_sphere(mi.Point2f(u.ravel(), v.ravel()))
+    si = dr.zeros(mi.SurfaceInteraction3f, u.size)
+    si.wi = -directions
+    return np.array(directions)[:, np.array(scene.environment().eval(si)).sum(0).argmax()]
+
+
+def test_the_sun_comes_out_where_a_recovered_rotation_has_turned_it(tmp_path: Path) -> None:
+    old = mi.ScalarTransform4f().rotate([0, 0, 1], 20).rotate([1, 0, 0], -60)
+    turned = np.array((mi.ScalarTransform4f().rotate([0, 1, 0], 33) @ old).matrix, np.float32)
+    sky = {"type": "sunsky", "to_world": old, "sun_direction": [0.4, 0.8, 0.4]}
+    scene = BUILTINS["flat-colours"](resolution=4) | {"sky": sky}
+    run = mi.load_dict(scene, optimize=False)
+    params = mi.traverse(run)
+    params["sky.to_world"] = mi.Transform4f(turned)
+    params.update()
+    found = exported(Source(scene, {}, {}, {}), {"sky.to_world": turned})
+    same_pictures(found, tmp_path / "out")
+    looked = mi.load_file(str(tmp_path / "out/scene.xml"), optimize=False)
+    np.testing.assert_allclose(*(brightest(each) for each in (run, looked)))
+    stale = exported(Source(scene | {"sky": {**sky, "to_world": mi.ScalarTransform4f(turned)}}, {}, {}, {}), {})
+    (tmp_path / "stale").mkdir()
+    write_files(stale, tmp_path / "stale")
+    with pytest.raises(PathreplayError, match=r"'sky\.sun_direction' of .* is missing or different"):
+        require_same(found.scene, tmp_path / "stale")
 
 
 def test_names_of_copied_files_are_unique(tmp_path: Path) -> None:

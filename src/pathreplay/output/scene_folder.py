@@ -102,6 +102,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, object] | 
     """
     with errors_as("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene, floats = _loaded(source, values)
+        values = {**values, **_turned_suns(traversed(scene), values)}
         params = _set(scene, values)
         described, owners = describe(
             source.scene, source.arguments, source.plugins, source.cameras, floats, source.medium
@@ -185,6 +186,23 @@ def _loaded(source: Source, values: Arrays) -> tuple[mi.Scene, tuple[str, ...]]:
         gc.collect()  # Dr.Jit traces virtual calls through every instance in memory
         scene = source.load(floats)
     return scene, floats
+
+
+def _turned_suns(params: mi.SceneParameters, values: Arrays) -> Arrays:
+    """Return the directions of suns after a rotation by a recovered ``to_world``, by parameter key.
+
+    When ``to_world`` of a `sunsky` is assigned, Mitsuba rotates the sun, but does not update the parameter
+    ``sun_direction``. When Mitsuba loads a `sunsky`, ``sun_direction`` is the direction after ``to_world``. A `sunsky`
+    with a date has no property ``sun_direction``.
+    """
+    suns = {}
+    for key, value in values.items():
+        sky, _, name = key.rpartition(".")
+        sun = f"{sky}.sun_direction"
+        if name == "to_world" and sun in params and f"{sky}.hour" not in params and sun not in values:
+            new, old = (np.asarray(matrix, np.float64)[:3, :3] for matrix in (value, get_array(params[key])))
+            suns[sun] = np.float32(new @ np.linalg.inv(old) @ get_array(params[sun]).ravel())
+    return suns
 
 
 def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
