@@ -25,7 +25,7 @@ from pathreplay.inverse.dataset.capture import pinhole_camera, read_capture
 from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.inverse.images.io import exr_bytes, read_image
 from pathreplay.jobs import make_config, optimize
-from pathreplay.output.export import export_run, obj_bytes, write_files
+from pathreplay.output.export import _cameras, export_run, obj_bytes, write_files
 from pathreplay.output.scene_folder import Exported, Source, exported, require_same
 from pathreplay.platform.compat import mesh_arrays
 from pathreplay.scenes.builtin import BUILTINS
@@ -546,6 +546,16 @@ def test_the_cameras_of_a_run_can_be_read_as_a_capture(run: Path) -> None:
         ours, theirs = (mi.traverse(each) for each in (sensor, camera))
         for key in ("to_world", "x_fov"):
             np.testing.assert_allclose(get_array(theirs[key]), get_array(ours[key]), atol=1e-5)
+
+
+def test_a_cropped_camera_is_written_with_the_size_and_centre_of_its_crop() -> None:
+    crop = {"crop_width": 24, "crop_height": 20, "crop_offset_x": 12, "crop_offset_y": 4}
+    film = {"type": "hdrfilm", "width": 48, "height": 32}
+    camera = {"type": "perspective", "principal_point_offset_x": 0.1}
+    sensors = {"whole": {**camera, "film": film}, "part": {**camera, "film": film | crop}}
+    whole, part = _cameras(mi.load_dict({"type": "scene", **sensors}))["frames"]
+    assert [part[key] for key in ("w", "h", "fl_x", "fl_y")] == [24, 20, whole["fl_x"], whole["fl_y"]]
+    assert [part["cx"], part["cy"]] == pytest.approx([0.4 * 48 - 12, 12])
 
 
 @pytest.mark.parametrize("in_python", [False, True])

@@ -216,13 +216,14 @@ def _cameras(scene: mi.Scene) -> Json:
         params = mi.traverse(sensor)
         if sensor.class_name() != "PerspectiveCamera":
             continue
-        width, height = (int(n) for n in sensor.film().size())
-        focal = width / (2 * math.tan(math.radians(float(params["x_fov"][0])) / 2))
+        film = sensor.film()
+        size, crop, offset = ([int(n) for n in pair] for pair in (film.size(), film.crop_size(), film.crop_offset()))
+        focal = size[0] / (2 * math.tan(math.radians(float(params["x_fov"][0])) / 2))
         shift = [float(params[f"principal_point_offset_{axis}"][0]) for axis in "xy"]
         frames.append(
             {
-                "file_path": f"{sensor.id()}.exr", "w": width, "h": height, "fl_x": focal, "fl_y": focal,
-                "cx": (0.5 - shift[0]) * width, "cy": (0.5 - shift[1]) * height,
+                "file_path": f"{sensor.id()}.exr", "w": crop[0], "h": crop[1], "fl_x": focal, "fl_y": focal,
+                "cx": (0.5 - shift[0]) * size[0] - offset[0], "cy": (0.5 - shift[1]) * size[1] - offset[1],
                 "transform_matrix": (get_array(params["to_world"]).astype(np.float64) @ FACING).tolist(),
             }
         )  # fmt: skip
