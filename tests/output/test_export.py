@@ -396,6 +396,17 @@ def test_integrators_for_gradients_have_one_for_pictures_in_their_place(wanted: 
     assert bool(found.notes) == (wanted is not None and wanted["type"] != "direct")
 
 
+@pytest.mark.parametrize("where", ["the job", "the scene"])
+def test_caustics_that_mitsuba_leaves_out_are_told_with_the_options_that_render_them(where: str) -> None:
+    integrator = {"type": "pathreplay", "max_depth": 4, "hide_emitters": True, "caustics": "particles"}
+    scene = BUILTINS["cornell-box"](resolution=4)
+    if where == "the scene":
+        scene["integrator"] = integrator
+    _, note = exported(Source(scene, {}, {}, {}), {}, integrator if where == "the job" else None).notes
+    flags = "--integrator pathreplay -I caustics=particles -I max_depth=4 -I hide_emitters=true"
+    assert "'path' renders no caustics of point lights" in note and f"`{flags}`" in note
+
+
 FOGGY = """<scene version="3.0.0">
 <integrator type="pathreplay"><integer name="max_depth" value="4"/></integrator>
 <shape type="cube" id="box"><bsdf type="null"/><medium type="homogeneous" name="interior" id="field">

@@ -24,7 +24,7 @@ from pathreplay.platform.registration import PLUGINS
 from pathreplay.platform.threads import spare_thread
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import errors_as
-from pathreplay.scenes.loading import coarse_pictures
+from pathreplay.scenes.loading import as_xml_has_them, coarse_pictures
 from pathreplay.scenes.parameters import UNNAMED, get_array, is_empty, to_value
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
@@ -235,8 +235,8 @@ def _plain_plugins(described: Described) -> list[str]:
 def _plain_integrator(described: Described, wanted: Mapping[str, object] | None) -> list[str]:
     """Set the ``wanted`` integrator; default: the scene's, or `pathreplay` if the scene has none.
 
-    `ptracer` replaces `pathreplay_particles`, and `path` or `volpath` other differentiable integrators; a returned note
-    says so.
+    `ptracer` replaces `pathreplay_particles`, and `path` or `volpath` other differentiable integrators. Returned notes
+    say so, and that `path` and `volpath` trace no light paths.
     """
     root = described.nodes[0]
     children = dict(described.children(root))
@@ -247,7 +247,8 @@ def _plain_integrator(described: Described, wanted: Mapping[str, object] | None)
         options = {"type": "pathreplay"}  # the default integrator of jobs
     else:
         props = children[own].props
-        options = {"type": props.plugin_name(), **{name: props.get(name) for name in _KEPT if name in props}}
+        read = [name for name in (*_KEPT, "caustics") if name in props]
+        options = {"type": props.plugin_name(), **{name: props.get(name) for name in read}}
     name = options.pop("type")
     depth = _DEPTHS.get(name)
     if wanted is None and own is not None and depth is None:
@@ -255,6 +256,7 @@ def _plain_integrator(described: Described, wanted: Mapping[str, object] | None)
     media = any(node.type == mi.ObjectType.Medium for node in described.nodes)
     plain = "ptracer" if name == _PARTICLES else "volpath" if media else "path"
     properties = mi.Properties(name if depth is None else plain)
+    caustics = options.get("caustics")
     if depth is not None:
         options = {"max_depth": depth, **{option: value for option, value in options.items() if option in _KEPT}}
     for option, value in options.items():
@@ -264,5 +266,12 @@ def _plain_integrator(described: Described, wanted: Mapping[str, object] | None)
     root.props["integrator"] = described.add(properties, mi.ObjectType.Integrator)
     if depth is None:
         return []
-    stands_in = properties.plugin_name()
-    return [f"'{stands_in}' renders the exported scene instead of '{name}', a differentiable integrator"]
+    notes = [f"'{plain}' renders the exported scene instead of '{name}', a differentiable integrator"]
+    if caustics == "particles":
+        given = as_xml_has_them({"caustics": caustics, **options})
+        flags = " ".join(f"-I {option}={value}" for option, value in given.items())
+        notes.append(
+            f"'{plain}' renders no caustics of point lights, and other caustics with more noise; to render "
+            f"them, append `--integrator {name} {flags}` to the command `pathreplay render`"
+        )
+    return notes
