@@ -192,6 +192,13 @@ def test_the_index_of_glass_comes_out_as_that_of_mitsubas_plugin(tmp_path: Path)
     assert b'type="dielectric"' in found.files["scene.xml"] and b"1.309" in found.files["scene.xml"]
 
 
+def test_the_index_of_a_made_mesh_of_glass_comes_out(tmp_path: Path) -> None:
+    scene = BUILTINS["caustic-lens"](resolution=8, **SMALL["caustic-lens"])
+    found = exported(Source(scene, {}, {"dielectric": "dielectric_ad"}, {}), {"lens.bsdf.eta": np.float32([1.31])})
+    same_pictures(found, tmp_path / "out")
+    assert b"1.309" in found.files["scene.xml"]
+
+
 TURNED = mi.ScalarTransform4f().translate([0, 0.2, 0.5]).rotate([1, 0, 0], 50)
 #: Parts of a scene, and the value of a parameter.
 PARTS: dict[str, tuple[dict[str, Any], str, Any]] = {

@@ -170,6 +170,18 @@ def test_a_run_of_the_example_exports_a_closed_lens(tmp_path: Path) -> None:
     assert mi.traverse(lens.bsdf())["eta"] == pytest.approx(1.5)
 
 
+def test_the_index_of_a_built_in_lens_has_a_derivative() -> None:
+    """The scene contains a mesh with a loaded `dielectric`, which is replaced like one that a dictionary describes."""
+    size = {"resolution": 8, "rows": 8, "columns": 8}
+    view = pathreplay.View("camera", target=np.ones((8, 8, 1), np.float32))
+    integrator = {"type": "pathreplay_particles", "max_depth": 4, "boundary": "none"}
+    problem = pathreplay.Problem(
+        "caustic-lens", ["lens.bsdf.eta"], view, scene_parameters=size, integrator=integrator, spp=16
+    )
+    gradient = pathreplay.value_and_grad(problem)()[1]["lens.bsdf.eta"]
+    assert np.isfinite(gradient).all() and (gradient != 0).all()
+
+
 def test_a_slab_takes_any_material() -> None:
     made = slab(3, 3, 2.0, 0.5, {"type": "dielectric_ad", "int_ior": 1.4})
     assert "bsdf.eta" in mi.traverse(made)

@@ -63,7 +63,10 @@ def load_scene_with(
         return scene, exchanged
     if str(spec) in BUILTINS:
         with errors_as(f"Built-in scene '{spec}' cannot be created with {parameters}"):
-            return load_dict_with(builtin_dict(str(spec), parameters), plugins, cameras, floats)
+            made = builtin_dict(str(spec), parameters)
+            glass = _exchanged_glass(made, plugins)
+            scene, exchanged = load_dict_with(made, plugins, cameras, floats)
+        return scene, [*glass, *exchanged]
     path = Path(spec) if base is None else Path(base) / spec
     if (problem := file_problem(path)) == MISSING:
         raise PathreplayError(_unknown(str(spec), path))
@@ -165,6 +168,22 @@ def builtin_dict(name: str, parameters: Mapping[str, object]) -> SceneDict:
             assert isinstance(value, int)  # `_remedy` has checked the type
             memory.require(COSTS[key](value), f"{what} and", "give a smaller number")
     return make(**parameters)
+
+
+def _exchanged_glass(scene: SceneDict, plugins: Mapping[str, str]) -> list[str]:
+    """Replace the `dielectric` of the meshes of a built-in scene, which `load_dict_with` does not change.
+
+    Returns one line per replaced plugin, with the id of its mesh.
+    """
+    glass = {
+        name: mesh
+        for name, mesh in scene.items()
+        if "dielectric" in plugins and isinstance(mesh, mi.Mesh) and mesh.bsdf().class_name() == "SmoothDielectric"
+    }
+    for mesh in glass.values():
+        index = mi.traverse(mesh.bsdf())["eta"]
+        mesh.set_bsdf(mi.load_dict({"type": plugins["dielectric"], "int_ior": index, "ext_ior": 1.0}))
+    return [f"{name} (made mesh)" for name in glass]
 
 
 def _remedy(kind: str, value: object) -> str:
