@@ -406,6 +406,23 @@ def test_edges_behind_mirrors_are_told_once(log, forward: bool) -> None:
         assert [words in line for line in log if "edge" in line] == [True]
 
 
+def test_moments_of_samples_move_with_the_camera_but_without_edges(log) -> None:
+    """Reverse and forward mode agree, and one line names what is left out."""
+    scene = mi.load_dict(lit_room(DIFFUSE))
+    params = mi.traverse(scene)
+    dr.enable_grad(params["camera.to_world"])
+    params.update()
+    moment = mi.load_dict({"type": "moment", "inner": {"type": "pathreplay", "max_depth": 2}})
+    moment.render_backward(scene, params, dr.ones(mi.TensorXf, (16, 16, 9)), seed=1, spp=4)
+    gradient = np.array(dr.grad(params["camera.to_world"]).matrix)[..., 0]
+    direction = np.zeros((4, 4), np.float32)
+    direction[:3, 3] = 0.5, -0.3, 1
+    dr.set_grad(params["camera.to_world"], mi.Transform4f(direction))
+    tangent = np.array(moment.render_forward(scene, params, seed=1, spp=4))
+    assert np.vdot(gradient, direction) == pytest.approx(tangent.sum(), rel=1e-3)
+    assert len([line for line in log if "'camera.to_world' moves" in line and "'moment'" in line]) == 1
+
+
 def test_lost_adjoints_are_told_with_their_share(log, monkeypatch) -> None:
     """A direction held at a hit that is made infinite: its adjoint cannot be finite."""
     from pathreplay.transport import scatter

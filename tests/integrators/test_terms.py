@@ -126,6 +126,24 @@ def test_sample_gives_what_it_says(load) -> None:
     assert integrator.state_dict() == {}
 
 
+def test_moments_of_samples_have_the_gradients_of_prb(load) -> None:
+    """Mitsuba's `moment` differentiates what `sample` returns: colour, and the square of each sample."""
+    scene, params = load(lit_room(DIFFUSE), COLOUR)
+    found = []
+    for plugin in ("pathreplay", "prb"):
+        moment = mi.load_dict({"type": "moment", "inner": {"type": plugin, "max_depth": 3}})
+        weights = mi.TensorXf(np.random.default_rng(0).random((16, 16, 9), np.float32))
+        dr.clear_grad(params[COLOUR])
+        moment.render_backward(scene, params, weights, seed=1, spp=SPP)
+        gradient = np.array(dr.grad(params[COLOUR])).ravel()
+        dr.set_grad(params[COLOUR], 1)
+        found.append((gradient, np.array(moment.render_forward(scene, params, seed=1, spp=SPP))))
+    (gradient, tangent), (other, others) = found
+    assert np.abs(gradient).min() > 0 and all(np.abs(tangent[..., c]).max() > 0 for c in range(9))
+    np.testing.assert_allclose(gradient, other, rtol=1e-4)
+    np.testing.assert_allclose(tangent, others, rtol=1e-3, atol=1e-5)
+
+
 def test_what_was_learned_outlives_another_scene_between(load) -> None:
     scene, params = load(foggy(), DENSITY)
     still = mi.load_dict(lit_room({"type": "diffuse"}))

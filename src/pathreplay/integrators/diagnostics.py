@@ -134,6 +134,16 @@ def camera_doubts(trace: TraceConfig) -> Iterator[str]:
         )
 
 
+def sample_doubts(trace: TraceConfig) -> Iterator[str]:
+    """Yield messages about the derivatives that are missing where Mitsuba differentiates single camera paths."""
+    moving = keys_that_move_edges(mi.traverse(trace.scene))
+    if moving:
+        yield (
+            f"'{moving[0]}' moves, and the gradient of an integrator around 'pathreplay' (Mitsuba's 'moment') leaves "
+            "out moving edges (silhouettes, shadows, borders of lights): differentiate an image of 'pathreplay' itself"
+        )
+
+
 def particle_doubts(trace: TraceConfig) -> Iterator[str]:
     """Yield messages about properties of the scene that make the gradient of light paths incomplete."""
     for texels in facts_of(trace.scene).dark_texels():

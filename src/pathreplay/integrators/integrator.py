@@ -29,6 +29,7 @@ from pathreplay.integrators.diagnostics import (
     offset_note,
     particle_doubts,
     particle_notes,
+    sample_doubts,
     sun_note,
     used_before_note,
 )
@@ -413,6 +414,10 @@ class PathReplayIntegrator(PathIntegrator):
             self.warned.add(EDGES)
         if note:
             self._warn_once(note)
+
+    def _log_sample_notes(self, trace: TraceConfig) -> None:
+        for doubt in (*doubts(trace), *sample_doubts(trace)):
+            self._warn_once(doubt)
 
     def _warn_once(self, message: str) -> None:
         if message not in self.warned:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +16,7 @@ from pathreplay.adjoint.driver import Driver, ForwardDriver
 from pathreplay.adjoint.emission_only import lights_or
 from pathreplay.adjoint.forward import forward
 from pathreplay.adjoint.pixel_sweep import PixelLoss, pixel_sweep
+from pathreplay.adjoint.primal import primal
 from pathreplay.adjoint.ray_jacobian import Recovery
 from pathreplay.adjoint.record import deepest
 from pathreplay.adjoint.replay import replay
@@ -21,8 +24,10 @@ from pathreplay.adjoint.sweep import sweep
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.image import adjoint, splat
 from pathreplay.integrators.film.pixel_passes import pixel_camera
+from pathreplay.integrators.lifetimes import careful
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.device import device_of
+from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
 
@@ -55,8 +60,75 @@ def back_propagate(view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, driver:
     return TermResult(lost=lost.count, paths=paths, moves=moves) if moves or trace.media is not None else TermResult()
 
 
+class Interior(Term, Protocol):
+    """An interior term, whose drivers can also differentiate paths along rays that a caller has sampled."""
+
+    def drivers(self, trace: TraceConfig) -> tuple[TraceConfig, Driver, ForwardDriver]:
+        """Return the drivers, with the configuration that they need. No control variate is used."""
+
+
+class _Radiance(dr.CustomOp):
+    """Radiance with derivatives computed by two functions, so that AD of the caller's operations can continue."""
+
+    def eval(
+        self,
+        L: mi.Spectrum,
+        tangent: Callable[[], mi.Spectrum],
+        back_propagate: Callable[[mi.Spectrum], None],
+        inputs: object,
+    ) -> mi.Spectrum:
+        self.tangent, self.back_propagate = tangent, back_propagate
+        return L
+
+    def forward(self) -> None:
+        self.set_grad_out(self.tangent())
+
+    def backward(self) -> None:
+        self.back_propagate(self.grad_out())
+
+
+def differentiable_radiance(
+    interior: Interior,
+    trace: TraceConfig,
+    start: CameraStart,
+    inputs: object,
+    tell: Callable[[TermResult], None],
+) -> tuple[mi.Spectrum, mi.Bool]:
+    """Estimate the radiance along the rays of a ``start``, as `primal` does, with the derivative of the interior term.
+
+    ``inputs`` contains the variables with gradients on which the radiance may depend. The derivative is computed when
+    AD reaches the radiance; ``tell`` then receives the result of the pass. Not differentiated: what the drivers leave
+    out, and the motion of edges.
+    """
+    sampler, paths = start.sampler.clone(), dr.width(start.ray)
+    with dr.suspend_grad():
+        L, valid = primal(trace, start)
+
+    def again() -> CameraStart:
+        return replace(start, sampler=sampler.clone())
+
+    def tangent() -> mi.Spectrum:
+        with careful(), dr.suspend_grad():
+            prepared, _, driver = interior.drivers(trace)
+            lost = NonFiniteCounter()
+            δL, _, moves = driver(prepared, again(), lost)
+            dr.eval(δL)
+        tell(TermResult(lost=lost.count, paths=paths, moves=moves))
+        return δL
+
+    def back_propagate(δL: mi.Spectrum) -> None:
+        with careful(), dr.suspend_grad(), dr.isolate_grad():
+            prepared, driver, _ = interior.drivers(trace)
+            lost = NonFiniteCounter()
+            moves = driver(prepared, again(), δL, lost)
+            dr.eval()
+        tell(TermResult(lost=lost.count, paths=paths, moves=moves))
+
+    return dr.custom(_Radiance, L, tangent, back_propagate, inputs), valid
+
+
 @dataclass(frozen=True)
-class PathReplay(Term):
+class PathReplay(Interior):
     """The interior term: `forward` in forward mode, and `sweep`, `replay` or `emission_only` in reverse mode.
 
     The docstrings of these functions state what is not differentiated. Unlike `sweep`, `replay` does not differentiate
@@ -72,15 +144,16 @@ class PathReplay(Term):
         return tangent(view, self._with_baseline(trace, learned), forward)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        trace = self._with_baseline(trace, learned)
-        stats, driver = None, partial(replay, recovery=self.recovery)
-        if self._sweeps(trace):
-            stats = None if learned is None or trace.media is None else BaselineStats.none(learned.cells, *view.keys)
-            driver = partial(sweep, seen=stats)
-        else:
+        trace, stats = self._with_baseline(trace, learned), None
+        if not self._sweeps(trace):
             trace = replace(trace, baseline=None)
-        result = back_propagate(view, trace, grad_in, lights_or(driver) if self.auto else driver)
-        return replace(result, stats=stats)
+        elif learned is not None and trace.media is not None:
+            stats = BaselineStats.none(learned.cells, *view.keys)
+        return replace(back_propagate(view, trace, grad_in, self._reverse_driver(trace, stats)), stats=stats)
+
+    def drivers(self, trace: TraceConfig) -> tuple[TraceConfig, Driver, ForwardDriver]:
+        trace = self._with_baseline(trace, None)
+        return trace, self._reverse_driver(trace, None), forward
 
     def pixels(self, view: Pass, trace: TraceConfig, loss: PixelLoss, some: mi.UInt32 | None) -> TermResult:
         """Render the image and back-propagate the loss in one pass: see `pixel_sweep`. The scene must have no media.
@@ -106,6 +179,10 @@ class PathReplay(Term):
             f"{device.name or 'the GPU'}: paths are replayed instead (adjoint = 'replay'); "
             f"up to max_depth = {deepest(trace, device)} they are recorded"
         )
+
+    def _reverse_driver(self, trace: TraceConfig, seen: BaselineStats | None) -> Driver:
+        driver = partial(sweep, seen=seen) if self._sweeps(trace) else partial(replay, recovery=self.recovery)
+        return lights_or(driver) if self.auto else driver
 
     def _sweeps(self, trace: TraceConfig) -> bool:
         return self.adjoint == "recorded" and not (self.auto and trace.max_depth > deepest(trace))

@@ -17,6 +17,7 @@ from pathreplay.adjoint.primal import primal
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass, Seed, Which
 from pathreplay.integrators.film.image import splat
+from pathreplay.integrators.interior import Interior, differentiable_radiance
 from pathreplay.integrators.lifetimes import careful, is_recording
 from pathreplay.integrators.parts import parts, summed
 from pathreplay.integrators.pass_state import PassState
@@ -26,7 +27,7 @@ from pathreplay.integrators.scene_facts import SceneFacts, facts_of
 from pathreplay.integrators.stateful import Unlearned
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.registration import mitsuba_integrator
-from pathreplay.transport.facts.nodes import may_have_gradients, nodes_of
+from pathreplay.transport.facts.nodes import may_have_gradients, nodes_of, with_gradients
 from pathreplay.transport.facts.traits import Tables
 from pathreplay.transport.motion import path_moves, weights_vary
 from pathreplay.transport.path import PathState
@@ -79,7 +80,7 @@ class PathIntegrator(Unlearned):
     attach = "none"
     uses_sobol = False  # whether Owen-scrambled Sobol samples replace independent samples
     boundary = "none"  # boundary terms that are estimated
-    interior: Term
+    interior: Interior
     max_depth: int  # this member and the next belong to Mitsuba's integrator
     rr_depth: int
 
@@ -202,14 +203,25 @@ class PathIntegrator(Unlearned):
         active: mi.Bool | bool = True,
         **_: object,
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], None]:
-        """Estimate radiance along rays that start outside of media, for callers without a sensor (Mitsuba's `aov`).
+        """Estimate radiance along rays that start outside of media, for callers without a sensor (`aov`, `moment`).
 
-        Only the primal mode is supported; `render_forward` and `render_backward` differentiate. Raises PathreplayError
-        for the other modes.
+        If gradients are not suspended, AD can differentiate the result, as far as `differentiable_radiance` does. A
+        warning reports moving edges, which are not differentiated. Only the primal ``mode`` is supported. Raises
+        PathreplayError for the other modes.
         """
         if mode != dr.ADMode.Primal:
             raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
-        return *primal(self._trace_config(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
+        state = PathIntegrator.begin(self, scene)
+        trace, start = self._trace_config(scene, None, state), CameraStart(ray, sampler, mi.Bool(active))
+        inputs = ray.o, ray.d, with_gradients(scene)
+        if not dr.grad_enabled(inputs):
+            return *primal(trace, start), [], None
+
+        def tell(result: TermResult) -> None:
+            self._log_sample_notes(trace)
+            self.keep(scene, state.after(result))
+
+        return *differentiable_radiance(self.interior, trace, start, inputs, tell), [], None
 
     def begin(self, scene: mi.Scene) -> PassState:
         """Create the state of a pass over a scene.
@@ -252,6 +264,9 @@ class PathIntegrator(Unlearned):
 
     def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
         """Log notes about a pass after its kernels have been launched."""
+
+    def _log_sample_notes(self, trace: TraceConfig) -> None:
+        """Log notes about wrong or missing derivatives of the result of `sample`."""
 
     def pass_of(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:
         """Create a pass from the arguments of Mitsuba's methods."""

@@ -14,10 +14,10 @@ from pathreplay.integrators.baselines.listing import listing
 from pathreplay.integrators.baselines.naive import tape_backward, tape_forward
 from pathreplay.integrators.baselines.radiative import no_forward, radiative
 from pathreplay.integrators.camera_pass import Pass
-from pathreplay.integrators.interior import back_propagate, tangent
+from pathreplay.integrators.interior import Interior, back_propagate, tangent
 from pathreplay.integrators.path_integrator import PathIntegrator
 from pathreplay.integrators.properties import PATHS, choice, flag
-from pathreplay.integrators.term import Term, TermResult
+from pathreplay.integrators.term import TermResult
 from pathreplay.platform.properties import Property
 from pathreplay.transport.vertex import TraceConfig
 
@@ -31,7 +31,7 @@ LINEAR = Property(
 
 
 @dataclass(frozen=True)
-class OtherInterior(Term):
+class OtherInterior(Interior):
     """The interior term of a baseline, computed by ``reverse_driver`` and ``forward_driver``.
 
     Media are differentiated with the score-function estimator, without a control variate. Empty voxels get no
@@ -46,6 +46,9 @@ class OtherInterior(Term):
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         return back_propagate(view, trace, grad_in, self.reverse_driver)
+
+    def drivers(self, trace: TraceConfig) -> tuple[TraceConfig, Driver, ForwardDriver]:
+        return trace, self.reverse_driver, self.forward_driver
 
 
 class NaiveIntegrator(PathIntegrator):
