@@ -92,6 +92,12 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
             f"{value} leaves out a lobe, whose derivative is missing from the gradient: keep "
             "the value 0.001 inside of its range, as 'Problem' and jobs do; see docs/gradients.md"
         )
+    for bsdf in facts_of(trace.scene).lobe_choice():
+        yield (
+            f"{bsdf} ignores BSDFContext.component: derivatives with respect to parameters that change the choice "
+            "among its lobes (an index of refraction) are wrong, unless its weights are f / detach(probability): let "
+            "its 'sample' obey the component; see docs/bsdfs.md"
+        )
     if traits.splines_move and trace.attach != "none":
         yield (
             "control points of a bsplinecurve have gradients: where curves bend, the derivative of their shading is "

@@ -14,6 +14,7 @@ from pathreplay.platform import compat
 from pathreplay.transport.facts.absent_lobes import AbsentLobes, ranges_of
 from pathreplay.transport.facts.dark_texels import DarkTexels
 from pathreplay.transport.facts.facets import Facets
+from pathreplay.transport.facts.lobe_choice import LobeChoice
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of, plain_numbers, with_gradients
 from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
@@ -70,6 +71,7 @@ class SceneFacts:
         self._bounded = any(shape.is_medium_transition() for shape in self._shapes)
         self._bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
         self._absent_lobes, self._dark_texels = AbsentLobes(self._bsdfs), DarkTexels(self._lights)
+        self._lobe_choice = LobeChoice(self._bsdfs)
         self._with_constants = [
             node for node in nodes if isinstance(node, _kinds_with_constants()) and plain_numbers(node)
         ]
@@ -100,6 +102,10 @@ class SceneFacts:
     def absent_lobes(self) -> tuple[str, ...]:
         """Return the parameters that lack the derivative of a lobe (see `AbsentLobes`). Empty in a recording."""
         return () if is_recording() else self._absent_lobes.find()
+
+    def lobe_choice(self) -> tuple[str, ...]:
+        """Return the BSDFs that ignore the choice of a lobe (see `LobeChoice`). Empty in a recording."""
+        return () if is_recording() else self._lobe_choice.find()
 
     def dark_texels(self) -> tuple[str, ...]:
         """Return the emitters at whose black texels no light path starts (see `DarkTexels`). Empty in a recording."""
