@@ -1175,6 +1175,7 @@ class ImageBlock(Object):
 class Integrator(Object):
     hide_emitters: bool
     def __init__(self, props: Properties = ..., /) -> None: ...
+    def aov_names(self) -> list[str]: ...
     @overload
     def render(
         self, scene: Scene, sensor: Sensor, seed: _UInt = 0, spp: int = 0, develop: bool = True, evaluate: bool = True

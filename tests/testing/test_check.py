@@ -236,6 +236,28 @@ def test_choice_of_integrators() -> None:
     assert clear.class_name() == "PathIntegrator"
 
 
+def test_added_channels_are_compared_with_a_reference_that_has_them() -> None:
+    scene = mi.load_dict({"type": "scene"})
+    aov, plain = ({"type": "aov", "aovs": "d:depth", "inner": {"type": kind}} for kind in ("pathreplay", "path"))
+    tested = mi.load_dict(aov)
+    with pytest.raises(PathreplayError, match=r"'aov' adds channels.*'path' lacks: pass the integrator inside"):
+        reference_integrator(None, scene, tested)
+    assert reference_integrator(plain, scene, tested).aov_names() == tested.aov_names()
+
+
+@pytest.mark.parametrize("around", [{"type": "aov", "aovs": "d:depth"}, {"type": "moment"}], ids=["aov", "moment"])
+def test_the_integrator_inside_of_a_scenes_own_is_checked_with_a_warning(
+    around: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr("pathreplay.testing.reference.mi.Log", lambda _, text: told.append(text))
+    inner = {"type": "pathreplay", "max_depth": 4, "attach": "none"}
+    scene = mi.load_dict({"type": "scene", "integrator": {**around, "inner": inner}})
+    tested = integrator_under_test(None, scene)
+    assert read_limits(tested) == Limits(4, 5, False) and stateful(tested).options()["attach"] == "none"
+    assert len(told) == 1 and f"'{around['type']}' adds channels" in told[0] and "'pathreplay', takes its" in told[0]
+
+
 def test_unbounded_paths_of_a_scene_are_not_those_of_ours() -> None:
     """As in a job. Unbounded paths are the default of `path`, rarely intended, and cannot be recorded."""
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "rr_depth": 7, "hide_emitters": True}})

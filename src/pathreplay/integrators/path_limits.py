@@ -30,13 +30,18 @@ class Limits:
     hide_emitters: bool
 
 
+def nested_in(integrator: mi.Integrator) -> list[mi.Integrator]:
+    """Return the integrators that an integrator contains (Mitsuba's ``aov``, ``moment``)."""
+    return [node for node in nodes_of(integrator) if isinstance(node, mi.Integrator)]
+
+
 def read_limits(integrator: mi.Integrator) -> Limits | None:
     """Read the limits of any integrator; None if its path length cannot be read.
 
     The limits of an integrator that contains another one (Mitsuba's ``aov``, ``moment``) are those of the other one.
     """
     known = isinstance(integrator, mi.Integrator)  # callers may not have checked what a user has given
-    inner = [node for node in nodes_of(integrator) if isinstance(node, mi.Integrator)] if known else []
+    inner = nested_in(integrator) if known else []
     if inner:
         return read_limits(inner[0]) if len(inner) == 1 else None
     # Python integrators have attributes; C++ integrators only print the values.

@@ -12,9 +12,10 @@ from typing import TypeAlias
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.integrators.path_limits import counterpart, read_limits, without_unbounded
+from pathreplay.integrators.path_limits import counterpart, nested_in, read_limits, without_unbounded
 from pathreplay.integrators.stateful import stateful
 from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.testing.objective import integrator_name
 
 Spec: TypeAlias = "mi.Integrator | Mapping[str, object] | str | None"
 """An integrator: an object, a dictionary, a plugin name, or None for the default."""
@@ -44,7 +45,8 @@ def integrator_under_test(
     ``path``, our plugins keep their own default, as in a job. ``max_depth`` replaces the path length of the
     integrator. ``boundary`` contains additional properties (``boundary``, ``boundary_spp``). With ``boundary``, None
     selects the scene's own integrator if it has these properties, else ``pathreplay``. If the scene's own integrator is
-    selected, it keeps its other properties.
+    selected, it keeps its other properties. If the scene's own integrator adds channels to the image (``aov``), the
+    integrator inside of it takes its place, and a warning says so.
 
     Raises PathreplayError if Mitsuba cannot create the integrator, if ``max_depth`` is invalid or given with an object,
     if the other properties of the scene's own integrator cannot be read to replace its ``max_depth``, or if boundary
@@ -52,7 +54,7 @@ def integrator_under_test(
     """
     if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
         raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
-    own = scene.integrator()
+    own = _without_channels(scene.integrator(), tell=spec is None)
     if spec is None and max_depth is None and not boundary and isinstance(own, mi.CppADIntegrator):
         return own
     if isinstance(spec, mi.Integrator):
@@ -83,6 +85,20 @@ def integrator_under_test(
     return load_integrator(description | dict(boundary or {}))
 
 
+def _without_channels(own: mi.Integrator | None, tell: bool) -> mi.Integrator | None:
+    """Return the integrator inside of one that adds channels to the image (`aov`, `moment`), or else ``own``."""
+    inner = nested_in(own) if own is not None and own.aov_names() else []
+    if own is None or len(inner) != 1:
+        return own
+    if tell:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"pathreplay: the scene's integrator '{integrator_name(own)}' adds channels to the image, which are not "
+            f"checked: the integrator inside of it, '{integrator_name(inner[0])}', takes its place",
+        )
+    return inner[0]
+
+
 def _own_name(own: mi.Integrator | None, has_boundary: bool) -> str:
     """Return the plugin that continues the scene's own integrator with other properties.
 
@@ -109,20 +125,31 @@ def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> 
     not change. With roulette, a path could end at +h and continue at -h. Roulette also cannot handle negative
     throughputs, which occur if -h makes a reflectance negative.
 
-    Raises PathreplayError if the path length of the tested integrator cannot be read, or ``spec`` cannot be created.
+    Raises PathreplayError if the path length of the tested integrator cannot be read, if ``spec`` cannot be created, or
+    if the images of the two integrators have different numbers of channels.
     """
-    if isinstance(spec, mi.Integrator):
-        return spec
+    reference = spec if isinstance(spec, mi.Integrator) else load_integrator(_described(spec, scene, tested))
+    more, fewer = sorted((tested, reference), key=lambda integrator: -len(integrator.aov_names()))
+    if len(more.aov_names()) != len(fewer.aov_names()):
+        raise PathreplayError(
+            f"Integrator '{integrator_name(more)}' adds channels to the image, which '{integrator_name(fewer)}' lacks: "
+            "pass the integrator inside of it, or a reference with the same channels"
+        )
+    return reference
+
+
+def _described(spec: Mapping[str, object] | str | None, scene: mi.Scene, tested: mi.Integrator) -> dict[str, object]:
+    """Return the description of the reference: see `reference_integrator`."""
     if isinstance(spec, Mapping):
-        return load_integrator(dict(spec))
-    plain = counterpart(tested, scene)
-    if plain is None:
+        return dict(spec)
+    limits, plain = read_limits(tested), counterpart(tested, scene)
+    if limits is None or plain is None:
         raise PathreplayError(
             f"Integrator {type(tested).__name__} does not expose its max_depth; pass a reference integrator that "
             "computes the same image, for example reference={'type': 'path', 'max_depth': 6}"
         )
     if spec is not None:
-        plain = {"type": spec, **vars(read_limits(tested))}
-    if 0 <= plain["max_depth"] <= LONGEST_WITHOUT_ROULETTE:
+        plain = {"type": spec, **vars(limits)}
+    if 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE:
         plain["rr_depth"] = NO_ROULETTE
-    return load_integrator(plain)
+    return plain
