@@ -20,6 +20,11 @@ COST_OF_EDGES = (
     "boundary = 'primary' leaves out the edges that the camera does not see; see docs/boundary.md"
 )
 """Message about the cost of boundary terms that were enabled by default."""
+USED_BEFORE = (
+    "a seed was used before: a pass must not use a control variate that was learned from the same seed, so such a pass "
+    "uses none; give every pass its own seed"
+)
+"""Message about a pass that has already contributed to the control variate."""
 MOST_OMITTED = 0.02
 """Largest `omitted_distance` that needs no message, as a fraction of the size of the scene."""
 
@@ -46,14 +51,6 @@ def lost_note(lost: int, paths: int) -> str:
     """Format the message about paths with an incomplete gradient."""
     why = "a ray adjoint was not finite, or a ray crosses more boundaries of media than the record holds"
     return f"{lost / paths:.2%} of the paths lost a part of their gradient: {why}"
-
-
-def used_before_note(seed: int) -> str:
-    """Format the message about a pass that has already contributed to the control variate."""
-    return (
-        f"seed {seed} was used before: a pass must not use a control variate that was learned from the same seed, so "
-        "this pass uses none; give every pass its own seed"
-    )
 
 
 def doubts(trace: TraceConfig) -> Iterator[str]:

@@ -22,6 +22,7 @@ from pathreplay.integrators.boundary_term import Boundary
 from pathreplay.integrators.camera_pass import Pass, Seed, Which
 from pathreplay.integrators.diagnostics import (
     COST_OF_EDGES,
+    USED_BEFORE,
     camera_doubts,
     doubts,
     lost_note,
@@ -31,7 +32,6 @@ from pathreplay.integrators.diagnostics import (
     particle_notes,
     sample_doubts,
     sun_note,
-    used_before_note,
 )
 from pathreplay.integrators.film.camera_flow import CameraFlow
 from pathreplay.integrators.film.motion import FilmMotion
@@ -380,7 +380,8 @@ class PathReplayIntegrator(PathIntegrator):
         if trace.media is None or state.guess is None:
             return None
         if state.passes.intersection(self._camera_view(view).keys):
-            self._warn_once(used_before_note(view.keys[0][0]))
+            self._warn_once(USED_BEFORE)
+            self.silence([USED_BEFORE])  # about other scenes
             return None
         return state.guess
 
