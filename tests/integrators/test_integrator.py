@@ -423,6 +423,16 @@ def test_moments_of_samples_move_with_the_camera_but_without_edges(log) -> None:
     assert len([line for line in log if "'camera.to_world' moves" in line and "'moment'" in line]) == 1
 
 
+def test_moments_without_the_light_paths_are_told(log) -> None:
+    scene = mi.load_dict(lit_room(DIFFUSE))
+    params = mi.traverse(scene)
+    dr.enable_grad(params["light.emitter.radiance.value"])
+    params.update()
+    moment = mi.load_dict({"type": "moment", "inner": {"type": "pathreplay_particles"}})
+    moment.render_backward(scene, params, dr.ones(mi.TensorXf, (16, 16, 9)), seed=1, spp=4)
+    assert len([line for line in log if "lack the light paths" in line]) == 1
+
+
 def test_lost_adjoints_are_told_with_their_share(log, monkeypatch) -> None:
     """A direction held at a hit that is made infinite: its adjoint cannot be finite."""
     from pathreplay.transport import scatter

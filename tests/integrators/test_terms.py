@@ -144,6 +144,25 @@ def test_moments_of_samples_have_the_gradients_of_prb(load) -> None:
     np.testing.assert_allclose(tangent, others, rtol=1e-3, atol=1e-5)
 
 
+def test_added_channels_leave_the_gradient_of_the_colour(load) -> None:
+    """Around `pathreplay`, Mitsuba's `aov` adds the gradient of the albedo to that of the image."""
+    scene, params = load(lit_room(DIFFUSE), COLOUR)
+    inner = {"type": "pathreplay", "max_depth": 3}
+    aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo", "inner": inner})
+
+    def gradient(integrator: mi.Integrator, channels: int, used: slice) -> np.ndarray:
+        weights = np.zeros((16, 16, channels), np.float32)
+        weights[..., used] = 1
+        dr.clear_grad(params[COLOUR])
+        integrator.render_backward(scene, params, mi.TensorXf(weights), seed=1, spp=SPP)
+        return np.array(dr.grad(params[COLOUR])).ravel()
+
+    colour, albedo = gradient(aov, 6, slice(3)), gradient(aov, 6, slice(3, 6))
+    assert np.abs(albedo).min() > 0
+    np.testing.assert_allclose(colour, gradient(mi.load_dict(inner), 3, slice(3)), rtol=1e-5)
+    np.testing.assert_allclose(gradient(aov, 6, slice(6)), colour + albedo, rtol=1e-5)
+
+
 def test_what_was_learned_outlives_another_scene_between(load) -> None:
     scene, params = load(foggy(), DENSITY)
     still = mi.load_dict(lit_room({"type": "diffuse"}))

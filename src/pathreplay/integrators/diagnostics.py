@@ -137,8 +137,16 @@ def camera_doubts(trace: TraceConfig) -> Iterator[str]:
         )
 
 
-def sample_doubts(trace: TraceConfig) -> Iterator[str]:
-    """Yield messages about the derivatives that are missing where Mitsuba differentiates single camera paths."""
+def sample_doubts(trace: TraceConfig, light_paths: bool) -> Iterator[str]:
+    """Yield messages about what is missing where Mitsuba differentiates single camera paths.
+
+    With ``light_paths``, the integrator also traces paths from the emitters.
+    """
+    if light_paths:
+        yield (
+            "an integrator around this one (Mitsuba's 'moment') requests camera paths only: image and gradient lack "
+            "the light paths; use caustics = 'camera' of the integrator 'pathreplay'"
+        )
     moving = keys_that_move_edges(mi.traverse(trace.scene))
     if moving:
         yield (

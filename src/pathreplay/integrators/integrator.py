@@ -417,7 +417,7 @@ class PathReplayIntegrator(PathIntegrator):
             self._warn_once(note)
 
     def _log_sample_notes(self, trace: TraceConfig) -> None:
-        for doubt in (*doubts(trace), *sample_doubts(trace)):
+        for doubt in (*doubts(trace), *sample_doubts(trace, self.particles is not None)):
             self._warn_once(doubt)
 
     def _warn_once(self, message: str) -> None:
