@@ -16,12 +16,14 @@ import pytest
 import edge_media_scenes as media
 import edge_scenes as scenes
 from edge_truth import loaded, ours
+from pathreplay.boundary import search
 from pathreplay.boundary.chains import transmittance_of_chain
 from pathreplay.boundary.crofton import BEYOND, BISECTIONS, PlaneSegment, VisibilityProbe, bisect, detect, heading
 from pathreplay.boundary.emitters import BORDER, sample_at
 from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.boundary.primary import FilmCrossing, PrimarySearch
 from pathreplay.boundary.search import Resampled, SegmentDensity
+from pathreplay.boundary.secondary import SecondarySearch
 from pathreplay.boundary.volumetric import VolumetricSearch
 from pathreplay.integrators.boundary_term import INNER_LENGTHS
 from pathreplay.integrators.camera_pass import Pass
@@ -30,8 +32,10 @@ from pathreplay.integrators.lifetimes import careful
 from pathreplay.integrators.scene_facts import SceneFacts
 from pathreplay.platform.threads import one_thread
 from pathreplay.samplers.counter_sampler import ROUNDS, CounterSampler, key_of, quasi_random
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import Z_LIMIT
 from pathreplay.transport.facts.smoothing_groups import smoothing_groups
-from truth import bitmap, camera
+from truth import Bench, bitmap, camera
 
 
 def world(**film: Any) -> mi.Scene:
@@ -313,12 +317,34 @@ def test_a_medium_out_of_view_takes_no_edges_from_a_large_film() -> None:
         with careful(), dr.suspend_grad():
             view = Pass.of(scene, 0, 0, 1)
             trace = integrator._trace_config(scene, view.sensor)
-            edges = PrimarySearch.of(trace, FilmPlaces.of(view), 0.5).find(2**16, 8000, mi.UInt32(1))
+            (edges,) = PrimarySearch.of(trace, FilmPlaces.of(view), 0.5).find(2**16, 8, mi.UInt32(1))
         weights.append(np.abs(np.array(edges.crossings[0].weight)[0]))
     # Of the edges, 5 % had no weight, because both rays met the same surface. Threads add in varying order, so that the
     # two searches do not resample the same crossings.
     assert [(found > 0).mean() > 0.998 for found in weights] == [True, True]
     assert weights[1].sum() == pytest.approx(weights[0].sum(), rel=1e-2)
+
+
+@pytest.mark.parametrize("name", ["shadow_occluder", pytest.param("indirect_rough", marks=pytest.mark.slow)])
+def test_a_search_in_parts_finds_as_much(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory is proportional to the size of a part. Neither mean nor noise of a gradient depends on it."""
+    bench = Bench(scenes.BY_NAME[name])
+    bench.weigh(scenes.weights())
+    seeds, spp = range(12), 5
+    whole = np.array([bench.backward(ours(bench), seed, spp) for seed in seeds])
+    searched, importances = [], SecondarySearch._importances
+
+    def counted(self: SecondarySearch, path: Any) -> Any:
+        searched.append(dr.width(path.key))
+        return importances(self, path)
+
+    monkeypatch.setattr(search, "AT_ONCE", 600)
+    monkeypatch.setattr(SecondarySearch, "_importances", counted)
+    parts = np.array([bench.backward(ours(bench), seed + 100, spp) for seed in seeds])
+    bench.release()
+    assert max(searched) <= 600 < sum(searched) / len(seeds)
+    assert abs(gap(parts, whole).z) < Z_LIMIT, gap(parts, whole)
+    assert 1 / 3 < parts.std() / whole.std() < 3
 
 
 def test_hard_shadows_on_large_films_lose_no_edges() -> None:
@@ -334,7 +360,7 @@ def test_hard_shadows_on_large_films_lose_no_edges() -> None:
     with careful(), dr.suspend_grad():
         view = Pass.of(scene, 0, 0, 1)
         trace = integrator._trace_config(scene, view.sensor)
-        edges = PrimarySearch.of(trace, FilmPlaces.of(view), 0.5).find(2**16, 8000, mi.UInt32(1))
+        (edges,) = PrimarySearch.of(trace, FilmPlaces.of(view), 0.5).find(2**16, 8, mi.UInt32(1))
         crossing = edges.crossings[0]
         assert isinstance(crossing, FilmCrossing) and crossing.crease.shadow is not None
         on_floor = crossing.active & crossing.crease.shadow.exists
@@ -475,7 +501,7 @@ def test_beams_have_edges_where_they_are_seen(depth: int, by_chance: bool, dark:
     view = Pass.of(scene, 0, 0, 1)
     trace = mi.load_dict({"type": "pathreplay", "max_depth": depth})._trace_config(scene, view.sensor)
     with careful(), dr.suspend_grad():
-        edges = VolumetricSearch.of(trace, FilmPlaces.of(view), 0.5).find(2000, 200, mi.UInt32(1))
+        (edges,) = VolumetricSearch.of(trace, FilmPlaces.of(view), 0.5).find(2000, 10, mi.UInt32(1))
         weight = np.abs(edges.crossings[0].weight).sum()
     assert (weight == 0) == dark
 

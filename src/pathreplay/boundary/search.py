@@ -2,12 +2,14 @@
 
 Most segments cross no edge. A first kernel therefore probes all segments. Segments are then resampled by importance,
 and a second kernel bisects a fixed number of segments. The second kernel has the same number of lanes in every pass,
-and wastes none of them. A pilot pass with few segments determines the density of all other segments on the film.
+and wastes none of them. A pilot pass with few segments determines the density of all other segments on the film. Many
+segments are searched in parts, because memory is proportional to the number of segments in a part.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -32,6 +34,9 @@ AROUND = 1.0
 UNREFINED = 0.25
 """Default fraction of segments drawn from the previous density, because the pilot pass misses some edges."""
 
+AT_ONCE = 2**20
+"""Largest number of segments that are probed at once; in secondary searches, the largest number of paths."""
+
 Segments = TypeVar("Segments")
 """One segment per lane."""
 
@@ -46,17 +51,28 @@ class EdgeSearch(ABC, Generic[Segments]):
 
     bisection: ClassVar[Stream]  # random stream for the choice among the crossings of one segment
 
-    def find(self, n: int, resolved: int, seed: mi.UInt32) -> Edges:
-        """Probe ``n`` segments, resample ``resolved`` of them by importance, and return their edges, detached.
+    def find(self, n: int, closer: int, seed: mi.UInt32) -> Iterator[Edges]:
+        """Probe ``n`` segments, and resample one in ``closer`` by importance. Yield the edges of each part, detached.
 
-        A secondary search probes all segments of ``n`` paths instead.
+        A secondary search probes all segments of ``n`` paths instead. Each part takes one in several segments, because
+        consecutive segments are close to each other on the film.
         """
         search = self.guided(n, seed)
-        importance = search.detect(search.draw(dr.arange(mi.UInt32, n), n, seed))
-        chosen = Resampled.of(importance, resolved, seed)
-        weight = chosen.weight * dr.opaque(mi.Float, 1 / n)  # opaque: the kernel does not depend on n
-        generator = mi.PCG32(resolved, initstate=seed + int(self.bisection), initseq=dr.arange(mi.UInt32, resolved))
-        return search.resolve(search.draw(chosen.index, n, seed), weight, generator)
+        parts = -(-n // AT_ONCE)
+        for part in range(parts):
+            yield search._find_in(n, closer, seed, part, parts)
+
+    def _find_in(self, n: int, closer: int, seed: mi.UInt32, part: int, parts: int) -> Edges:
+        count = len(range(part, n, parts))
+        lanes = max(count // closer, 1)
+        # Opaque: the kernels depend neither on the part nor on n.
+        first, step, width, lane = (dr.opaque(mi.UInt32, x) for x in (part, parts, count, part * lanes))
+        importance = self.detect(self.draw(first + step * dr.arange(mi.UInt32, count), n, seed))
+        chosen = Resampled.of(importance, lanes, seed, lane)
+        number = chosen.index // width
+        i = number * n + first + step * (chosen.index - number * width)
+        generator = mi.PCG32(lanes, initstate=seed + int(self.bisection), initseq=lane + dr.arange(mi.UInt32, lanes))
+        return self.resolve(self.draw(i, n, seed), chosen.weight * dr.opaque(mi.Float, 1 / n), generator)
 
     def guided(self, n: int, seed: mi.UInt32) -> EdgeSearch[Segments]:
         """Run a pilot pass, and return a search with a refined density. Without a pilot pass, return this search."""
@@ -137,14 +153,17 @@ class Resampled:
     weight: mi.Float  # 1 / expected number of lanes that resolve the same segment; 0 if no segment has an edge
 
     @staticmethod
-    def of(mass: mi.Float, lanes: int, seed: mi.UInt32) -> Resampled:
-        """Resample segments in proportion to their ``mass``, with one stratum per lane."""
+    def of(mass: mi.Float, lanes: int, seed: mi.UInt32, first: mi.UInt32 | int = 0) -> Resampled:
+        """Resample segments in proportion to their ``mass``, with one stratum per lane.
+
+        The random numbers of a lane depend on ``seed`` and on its number, which starts at ``first``.
+        """
         dr.eval(mass)  # used twice below
         n = dr.width(mass)
         cdf = dr.cumsum(mi.Float64(mass))
         total = dr.gather(mi.Float64, cdf, n - 1)
         lane = dr.arange(mi.UInt32, lanes)
-        x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, lane, ROUNDS))) * (total / lanes)
+        x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, first + lane, ROUNDS))) * (total / lanes)
         index = _index_at(cdf, x)
         importance = dr.gather(mi.Float, mass, index)
         return Resampled(index, dr.select(importance > 0, mi.Float(total / lanes) / importance, 0))
@@ -159,7 +178,7 @@ def _index_at(cdf: mi.Float64, x: mi.Float64 | mi.Float) -> mi.UInt32:
 
 def pilot_size(n: int, size: mi.ScalarVector2f) -> int:
     """Return the number of pilot segments, for ``n`` segments on a film of ``size`` pixels."""
-    return max(min(n // PILOT_RATIO, PILOT_PER_PIXEL * int(size.x) * int(size.y)), 1)
+    return max(min(n // PILOT_RATIO, PILOT_PER_PIXEL * int(size.x) * int(size.y), AT_ONCE), 1)
 
 
 @dataclass(frozen=True)

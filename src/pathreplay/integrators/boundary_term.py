@@ -135,19 +135,19 @@ class Boundary(Term):
         segments_of(view, FilmPlaces.of(view), spp)
 
     def _searches(self, view: Pass, trace: TraceConfig, places: FilmPlaces) -> Iterator[Edges]:
-        """Run the edge searches that the scene and the options require, and yield the edges of each search."""
+        """Run the edge searches that the scene and the options require, and yield the edges of each of their parts."""
         trace = self.informed(view, trace)
         n, seed = segments_of(view, places, self.spp), Stream.BOUNDARY.of(view.opaque_seed)
-        on_film, length = max(n // FILM_CLOSER, 1), FILM_LENGTH * places.detail
+        length = FILM_LENGTH * places.detail
         if self.film and places.is_extended:
-            yield PrimarySearch.of(trace, places, length).find(n, on_film, seed)
+            yield from PrimarySearch.of(trace, places, length).find(n, FILM_CLOSER, seed)
             if trace.media is not None and trace.traits.hard_lights:
-                yield VolumetricSearch.of(trace, places, length).find(n, on_film, seed)
+                yield from VolumetricSearch.of(trace, places, length).find(n, FILM_CLOSER, seed)
         if self.inner and trace.max_depth > 1:
             search = SecondarySearch.of(trace, places, INNER_LENGTHS)
-            yield search.find(n, max(n // (NARROW_CLOSER if search.most_arcs > 1 else INNER_CLOSER), 1), seed)
+            yield from search.find(n, NARROW_CLOSER if search.most_arcs > 1 else INNER_CLOSER, seed)
             if trace.media is not None and trace.traits.hard_lights and trace.max_depth > 2:
-                yield ScatteredBeamSearch.of(trace, places, INNER_LENGTHS[1]).find(n, max(n // INNER_CLOSER, 1), seed)
+                yield from ScatteredBeamSearch.of(trace, places, INNER_LENGTHS[1]).find(n, INNER_CLOSER, seed)
 
 
 def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:

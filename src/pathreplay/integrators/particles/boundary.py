@@ -109,7 +109,7 @@ class ParticleBoundary(Term):
     def _searches(
         self, view: Pass, trace: TraceConfig, particles: Particles
     ) -> Iterator[tuple[EmissionSearch | EmissionBeamSearch, Edges]]:
-        """Run the edge searches that the scene requires, and yield each search with its edges."""
+        """Run the edge searches that the scene requires, and yield the edges of each part, with their search."""
         tables = facts_of(view.scene).recorded_tables(trace.traits.tables, edges=True)
         trace = Boundary.informed(replace(view, flow=None), replace(trace, traits=replace(trace.traits, tables=tables)))
         if any(shape.is_emitter() for shape in trace.traits.moving or ()):  # every edge moves relative to such light
@@ -120,4 +120,5 @@ class ParticleBoundary(Term):
             kinds.append(EmissionBeamSearch)
         for kind in kinds:
             search = kind.of(trace, domain, LENGTH)
-            yield search, search.find(n, max(n // CLOSER, 1), Stream.PARTICLE_EDGES.of(view.opaque_seed))
+            for edges in search.find(n, CLOSER, Stream.PARTICLE_EDGES.of(view.opaque_seed)):
+                yield search, edges
