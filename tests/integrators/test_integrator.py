@@ -419,8 +419,20 @@ def test_moments_of_samples_move_with_the_camera_but_without_edges(log) -> None:
     direction[:3, 3] = 0.5, -0.3, 1
     dr.set_grad(params["camera.to_world"], mi.Transform4f(direction))
     tangent = np.array(moment.render_forward(scene, params, seed=1, spp=4))
+    assert abs(tangent.sum()) > 1e-3
     assert np.vdot(gradient, direction) == pytest.approx(tangent.sum(), rel=1e-3)
     assert len([line for line in log if "'camera.to_world' moves" in line and "'moment'" in line]) == 1
+
+
+def test_moments_seen_by_one_camera_have_no_gradient_in_another() -> None:
+    room = lit_room(DIFFUSE)
+    scene = mi.load_dict({**room, "other": dict(room["camera"])}, optimize=False)
+    params = mi.traverse(scene)
+    dr.enable_grad(params["other.to_world"])
+    params.update()
+    moment = mi.load_dict({"type": "moment", "inner": {"type": "pathreplay", "max_depth": 2}})
+    moment.render_backward(scene, params, dr.ones(mi.TensorXf, (16, 16, 9)), sensor=0, seed=1, spp=4)
+    assert not np.any(np.array(dr.grad(params["other.to_world"]).matrix))
 
 
 def test_moments_without_the_light_paths_are_told(log) -> None:

@@ -203,6 +203,15 @@ GROUND = {
 }
 
 
+BULB = {"type": "point", "position": [1, 1, 2], "intensity": 2.0}
+HAZE = {
+    "type": "cube",
+    "to_world": T().scale(8),
+    "bsdf": {"type": "null"},
+    "interior": {"type": "homogeneous", "sigma_t": 0.05, "albedo": 0.8},
+}
+
+
 def under(sky: dict, bsdf: dict, mover: str, **more: dict) -> Objective:
     camera = sensor(place=T().look_at([0, 0, 3.2], [0, 0, 0], [0, 1, 0]), film=film(width=20, height=20))
     body = {"type": "sphere", "radius": 0.5, "bsdf": bsdf}
@@ -221,15 +230,18 @@ def under(sky: dict, bsdf: dict, mover: str, **more: dict) -> Objective:
         (PAINT, "body", 0, {"ground": GROUND}, 2, 8),
         ({"type": "conductor"}, "body", 25, {"ground": GROUND}, 2, 8),
         pytest.param({"type": "conductor"}, "camera", 0, {}, 2, 8, marks=pytest.mark.slow),
+        pytest.param({"type": "conductor"}, "body", 0, {"bulb": BULB}, 3, 16, marks=pytest.mark.slow),
+        pytest.param({"type": "conductor"}, "body", 0, {"fog": HAZE}, 3, 32, marks=pytest.mark.slow),
         pytest.param({"type": "dielectric"}, "body", 0, {}, 3, 32, marks=pytest.mark.slow),
     ],
-    ids=["ball", "camera", "glossy", "ground", "mirror", "camera before a mirror", "glass"],
+    ids=["ball", "camera", "glossy", "ground", "mirror", "camera before a mirror", "bulb", "fog", "glass"],
 )
 def test_a_horizon_is_an_edge(bsdf: dict, mover: str, tilt: float, more: dict, depth: int, passes: int) -> None:
     """A sunsky is black below its horizon, which is seen directly, in a mirror or in glass. No surface ends there."""
     place = T().rotate([0, 0, 1], tilt) @ HORIZON["to_world"]
     objective = under({**HORIZON, "to_world": place}, bsdf, mover, **more)
-    ours, plain = (mi.load_dict({"type": name, "max_depth": depth}) for name in ("pathreplay", "path"))
+    reference = "volpath" if "fog" in more else "path"
+    ours, plain = (mi.load_dict({"type": name, "max_depth": depth}) for name in ("pathreplay", reference))
     g = np.array([objective.backward(ours, seed, 64) for seed in range(passes)])
     d = np.array([objective.dot(objective.difference(plain, CENTRAL, 0.02, 100 + s, 512)) for s in range(8)])
     objective.put(dr.opaque(mi.Float, 0))

@@ -144,6 +144,20 @@ def test_moments_of_samples_have_the_gradients_of_prb(load) -> None:
     np.testing.assert_allclose(tangent, others, rtol=1e-3, atol=1e-5)
 
 
+def test_moments_reach_what_parameters_are_computed_from(load) -> None:
+    scene, params = load(lit_room(DIFFUSE), COLOUR)
+    kind, found = type(params[COLOUR]), []
+    for plugin in ("pathreplay", "prb"):
+        moment, x = mi.load_dict({"type": "moment", "inner": {"type": plugin, "max_depth": 3}}), mi.Float(0.6)
+        dr.enable_grad(x)
+        params[COLOUR] = kind(dr.square(x))
+        params.update()
+        image = mi.render(scene, params, integrator=moment, spp=SPP, seed=1)
+        dr.backward(dr.mean(dr.square(image), axis=None))
+        found.append(dr.grad(x)[0])
+    assert found[0] == pytest.approx(found[1], rel=1e-3) and found[0] != 0
+
+
 def test_added_channels_leave_the_gradient_of_the_colour(load) -> None:
     """Around `pathreplay`, Mitsuba's `aov` adds the gradient of the albedo to that of the image."""
     scene, params = load(lit_room(DIFFUSE), COLOUR)

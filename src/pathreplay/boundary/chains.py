@@ -103,8 +103,8 @@ def _probe_vertex(trace: TraceConfig, path: PathState, key: mi.UInt32, active: m
     if not traits.copies:
         si.shape = at.hit.shape
     away = turned_away(si, at.ray.d)
-    if traits.sunsky is not None:
-        away |= ~at.hit.is_valid() & (horizon_gap(traits.sunsky, at.ray.d) < 0)
+    if trace.horizon is not None:
+        away |= ~at.hit.is_valid() & (horizon_gap(trace.horizon, at.ray.d) < 0)
     signature = mixed(place_met(trace, at.hit, active, si.shape), dr.select(away, mi.UInt32(1), 0))
     probe = VisibilityProbe(signature, si.p, si.n)
     if not (traits.coarse_meshes or traits.brushed_meshes):

@@ -57,8 +57,8 @@ class Crease:
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
         same = both & (place_met(trace, a, both, si_a.shape) == place_met(trace, b, both, si_b.shape))
         turns = same & (turned_away(si_a, ray_a.d) != turned_away(si_b, ray_b.d)) & ~hides_itself(si_a, si_b)
-        sunsky = trace.traits.sunsky
-        return Crease(a, b, meets, turns, shadow, mi.Bool(False) if sunsky is None else sky, sunsky)
+        sky &= mi.Bool(trace.horizon is not None)
+        return Crease(a, b, meets, turns, shadow, sky, trace.horizon)
 
     @property
     def exists(self) -> mi.Bool:

@@ -21,8 +21,8 @@ COST_OF_EDGES = (
 )
 """Message about the cost of boundary terms that were enabled by default."""
 USED_BEFORE = (
-    "a seed was used before: a pass must not use a control variate that was learned from the same seed, so such a pass "
-    "uses none; give every pass its own seed"
+    "a seed was used before: a pass must not use a control variate that was learned from the same seed, so passes with "
+    "a repeated seed use none; give every pass its own seed"
 )
 """Message about a pass that has already contributed to the control variate."""
 MOST_OMITTED = 0.02
@@ -92,8 +92,8 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
     for bsdf in facts_of(trace.scene).lobe_choice():
         yield (
             f"{bsdf} ignores BSDFContext.component: derivatives with respect to parameters that change the choice "
-            "among its lobes (an index of refraction) are wrong, unless its weights are f / detach(probability): let "
-            "its 'sample' obey the component; see docs/bsdfs.md"
+            "among its lobes (an index of refraction, an opacity) are wrong, unless its weights are "
+            "f / detach(probability): let its 'sample' obey the component; see docs/bsdfs.md"
         )
     if traits.splines_move and trace.attach != "none":
         yield (
@@ -138,9 +138,10 @@ def camera_doubts(trace: TraceConfig) -> Iterator[str]:
 
 
 def sample_doubts(trace: TraceConfig, light_paths: bool) -> Iterator[str]:
-    """Yield messages about what is missing where Mitsuba differentiates single camera paths.
+    """Yield messages about what is missing where Mitsuba's `moment` differentiates single camera paths.
 
-    With ``light_paths``, the integrator also traces paths from the emitters.
+    Mitsuba's `aov` takes the gradient of its inner integrator instead. With ``light_paths``, the integrator also traces
+    paths from the emitters.
     """
     if light_paths:
         yield (

@@ -10,7 +10,7 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.adjoint.autodiff import NonFiniteCounter
+from pathreplay.adjoint.autodiff import NonFiniteCounter, Unreached
 from pathreplay.adjoint.baseline import FIRST_BRANCHING, Baseline, BaselineStats
 from pathreplay.adjoint.driver import Driver, ForwardDriver
 from pathreplay.adjoint.emission_only import lights_or
@@ -73,18 +73,18 @@ class _Radiance(dr.CustomOp):
     def eval(
         self,
         L: mi.Spectrum,
-        tangent: Callable[[], mi.Spectrum],
-        back_propagate: Callable[[mi.Spectrum], None],
+        forward_pass: Callable[[], mi.Spectrum],
+        reverse_pass: Callable[[mi.Spectrum], None],
         inputs: object,
     ) -> mi.Spectrum:
-        self.tangent, self.back_propagate = tangent, back_propagate
+        self.forward_pass, self.reverse_pass = forward_pass, reverse_pass
         return L
 
     def forward(self) -> None:
-        self.set_grad_out(self.tangent())
+        self.set_grad_out(self.forward_pass())
 
     def backward(self) -> None:
-        self.back_propagate(self.grad_out())
+        self.reverse_pass(self.grad_out())
 
 
 def differentiable_radiance(
@@ -107,7 +107,7 @@ def differentiable_radiance(
     def again() -> CameraStart:
         return replace(start, sampler=sampler.clone())
 
-    def tangent() -> mi.Spectrum:
+    def forward_pass() -> mi.Spectrum:
         with careful(), dr.suspend_grad():
             prepared, _, driver = interior.drivers(trace)
             lost = NonFiniteCounter()
@@ -116,15 +116,18 @@ def differentiable_radiance(
         tell(TermResult(lost=lost.count, paths=paths, moves=moves))
         return δL
 
-    def back_propagate(δL: mi.Spectrum) -> None:
-        with careful(), dr.suspend_grad(), dr.isolate_grad():
-            prepared, driver, _ = interior.drivers(trace)
-            lost = NonFiniteCounter()
-            moves = driver(prepared, again(), δL, lost)
-            dr.eval()
+    def reverse_pass(δL: mi.Spectrum) -> None:
+        lost = NonFiniteCounter()
+        try:
+            with careful(), dr.suspend_grad(), dr.isolate_grad():
+                prepared, driver, _ = interior.drivers(trace)
+                moves = driver(prepared, again(), δL, lost)
+                dr.eval()
+        except Unreached:  # other operations of the caller may depend on the parameters
+            return
         tell(TermResult(lost=lost.count, paths=paths, moves=moves))
 
-    return dr.custom(_Radiance, L, tangent, back_propagate, inputs), valid
+    return dr.custom(_Radiance, L, forward_pass, reverse_pass, inputs), valid
 
 
 @dataclass(frozen=True)

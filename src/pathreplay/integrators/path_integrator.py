@@ -205,8 +205,8 @@ class PathIntegrator(Unlearned):
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], None]:
         """Estimate radiance along rays that start outside of media, for callers without a sensor (`aov`, `moment`).
 
-        If gradients are not suspended, AD can differentiate the result, as far as `differentiable_radiance` does. A
-        warning reports moving edges, which are not differentiated. Only the primal ``mode`` is supported. Raises
+        If gradients are not suspended, AD differentiates the result; `differentiable_radiance` states what is left out.
+        A warning reports moving edges, which are not differentiated. Only the primal ``mode`` is supported. Raises
         PathreplayError for the other modes.
         """
         if mode != dr.ADMode.Primal:
@@ -215,7 +215,8 @@ class PathIntegrator(Unlearned):
         trace, start = self._trace_config(scene, None, state), CameraStart(ray, sampler, mi.Bool(active))
         inputs = ray.o, ray.d, with_gradients(scene)
         if not dr.grad_enabled(inputs):
-            return *primal(trace, start), [], None
+            with dr.suspend_grad():
+                return *primal(trace, start), [], None
 
         def tell(result: TermResult) -> None:
             self._log_sample_notes(trace)

@@ -67,7 +67,7 @@ def horizon_gap(sunsky: mi.Emitter, d: mi.Vector3f) -> mi.Float:
 
     Differentiable in ``d``.
     """
-    return dr.dot(dr.detach(sunsky.world_transform()) @ mi.Vector3f(0, 0, 1), d)
+    return (dr.detach(sunsky.world_transform()).inverse() @ d).z
 
 
 def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:

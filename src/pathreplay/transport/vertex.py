@@ -87,6 +87,11 @@ class TraceConfig:
         return bool(self.traits.attachables) and (narrow or self.attach == "all")
 
     @property
+    def horizon(self) -> mi.Emitter | None:
+        """The `sunsky` whose horizon is an edge; None without a `sunsky`, and on light paths, which end at the sky."""
+        return self.traits.sunsky if self.to_sensor is None else None
+
+    @property
     def branch(self) -> bool:
         """Whether an extra path starts at one null collision of each path (see `null_branching`)."""
         return self.branching is not None

@@ -1,4 +1,4 @@
-"""Lobe choice: BSDFs of the user, written in Python, that do not sample a lobe alone when `BSDFContext` asks for it.
+"""Lobe choice: BSDFs of the user, written in Python, that ignore ``BSDFContext.component``.
 
 The derivatives of their delta lobes are those of the weights that they return: see `scatter._delta_weight`.
 """
@@ -36,7 +36,10 @@ class LobeChoice:
 
 
 def _samples_alone(bsdf: mi.BSDF, component: int) -> bool:
-    """Return whether a BSDF samples no other lobe if `BSDFContext.component` asks for one lobe."""
+    """Return whether a BSDF samples no other lobe if `BSDFContext.component` asks for one lobe.
+
+    The interaction is not on a shape. The result is True if the BSDF raises an error for it.
+    """
     random = mi.PCG32(PROBES)
     u, v, w, x, y = (mi.Float(random.next_float32()) for _ in range(5))
     si = dr.zeros(mi.SurfaceInteraction3f, PROBES)
@@ -47,6 +50,9 @@ def _samples_alone(bsdf: mi.BSDF, component: int) -> bool:
     ctx = mi.BSDFContext()
     ctx.component = component
     with dr.suspend_grad():
-        sample, weight = bsdf.sample(ctx, si, w, mi.Point2f(x, y), mi.Bool(True))
+        try:
+            sample, weight = bsdf.sample(ctx, si, w, mi.Point2f(x, y), mi.Bool(True))
+        except Exception:  # code of the user, which the pass itself calls on shapes only
+            return True
         alone = (sample.sampled_component == component) & ((sample.sampled_type & bsdf.flags(component)) != 0)
         return bool(dr.all(alone | dr.all(weight == 0)))
