@@ -411,7 +411,7 @@ def test_caustics_that_mitsuba_leaves_out_are_told_with_the_options_that_render_
         scene["integrator"] = integrator
     _, note = exported(Source(scene, {}, {}, {}), {}, integrator if where == "the job" else None).notes
     flags = "--integrator pathreplay -I caustics=particles -I max_depth=4 -I hide_emitters=true"
-    assert "'path' renders no caustics of point lights" in note and f"`{flags}`" in note
+    assert "'path' renders no caustics of lights without extent" in note and f"`{flags}`" in note
 
 
 FOGGY = """<scene version="3.0.0">

@@ -178,6 +178,7 @@ def test_the_index_of_a_built_in_lens_has_a_derivative() -> None:
     problem = pathreplay.Problem(
         "caustic-lens", ["lens.bsdf.eta"], view, scene_parameters=size, integrator=integrator, spp=16
     )
+    assert problem.initial["lens.bsdf.eta"] == pytest.approx(1.5)
     gradient = pathreplay.value_and_grad(problem)()[1]["lens.bsdf.eta"]
     assert np.isfinite(gradient).all() and (gradient != 0).all()
 

@@ -235,8 +235,8 @@ def _plain_plugins(described: Described) -> list[str]:
 def _plain_integrator(described: Described, wanted: Mapping[str, object] | None) -> list[str]:
     """Set the ``wanted`` integrator; default: the scene's, or `pathreplay` if the scene has none.
 
-    `ptracer` replaces `pathreplay_particles`, and `path` or `volpath` other differentiable integrators. Returned notes
-    say so, and that `path` and `volpath` trace no light paths.
+    `ptracer` replaces `pathreplay_particles`, and `path` or `volpath` other differentiable integrators. Returns notes
+    about the replacement, and about the light paths that it lacks.
     """
     root = described.nodes[0]
     children = dict(described.children(root))
@@ -271,7 +271,7 @@ def _plain_integrator(described: Described, wanted: Mapping[str, object] | None)
         given = as_xml_has_them({"caustics": caustics, **options})
         flags = " ".join(f"-I {option}={value}" for option, value in given.items())
         notes.append(
-            f"'{plain}' renders no caustics of point lights, and other caustics with more noise; to render "
+            f"'{plain}' renders no caustics of lights without extent, and other caustics with more noise; to render "
             f"them, append `--integrator {name} {flags}` to the command `pathreplay render`"
         )
     return notes

@@ -183,7 +183,7 @@ def _exchanged_glass(scene: SceneDict, plugins: Mapping[str, str]) -> list[str]:
     for mesh in glass.values():
         index = mi.traverse(mesh.bsdf())["eta"]
         mesh.set_bsdf(mi.load_dict({"type": plugins["dielectric"], "int_ior": index, "ext_ior": 1.0}))
-    return [f"{name} (made mesh)" for name in glass]
+    return [f"{name} (mesh of the built-in scene)" for name in glass]
 
 
 def _remedy(kind: str, value: object) -> str:
