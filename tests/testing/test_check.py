@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -245,17 +246,32 @@ def test_added_channels_are_compared_with_a_reference_that_has_them() -> None:
     assert reference_integrator(plain, scene, tested).aov_names() == tested.aov_names()
 
 
-@pytest.mark.parametrize("around", [{"type": "aov", "aovs": "d:depth"}, {"type": "moment"}], ids=["aov", "moment"])
-def test_the_integrator_inside_of_a_scenes_own_is_checked_with_a_warning(
-    around: dict, monkeypatch: pytest.MonkeyPatch
+AOV = {"type": "aov", "aovs": "d:depth"}
+OURS = {"type": "pathreplay", "max_depth": 4, "attach": "none"}
+
+
+@pytest.mark.parametrize(
+    ("own", "attach", "told"),
+    [
+        ({**AOV, "inner": OURS}, "none", "'aov' adds channels to .*, which are not checked: 'pathreplay' inside of it"),
+        ({"type": "moment", "inner": OURS}, "none", "'moment' adds .*: 'pathreplay' inside of it is$"),
+        ({**AOV, "inner": {"type": "moment", "inner": OURS}}, "none", "'aov' adds .*: 'pathreplay' inside of it is$"),
+        ({**AOV, "inner": {"type": "path", "max_depth": 4}}, "delta", "'aov' adds .*, which are not checked$"),
+        ({**AOV, "a": OURS, "b": {"type": "path"}}, "delta", "'aov' adds .*, which are not checked$"),
+    ],
+    ids=["aov", "moment", "moment inside of aov", "aov around path", "two inside of aov"],
+)
+def test_channels_that_a_scenes_own_integrator_adds_are_not_checked_and_named(
+    own: dict[str, Any], attach: str, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[str] = []
-    monkeypatch.setattr("pathreplay.testing.reference.mi.Log", lambda _, text: told.append(text))
-    inner = {"type": "pathreplay", "max_depth": 4, "attach": "none"}
-    scene = mi.load_dict({"type": "scene", "integrator": {**around, "inner": inner}})
+    """The integrator inside is named if that very object is checked, not for a new one with its limits."""
+    logged: list[str] = []
+    monkeypatch.setattr("pathreplay.testing.reference.mi.Log", lambda _, text: logged.append(text))
+    scene = mi.load_dict({"type": "scene", "integrator": own})
     tested = integrator_under_test(None, scene)
-    assert read_limits(tested) == Limits(4, 5, False) and stateful(tested).options()["attach"] == "none"
-    assert len(told) == 1 and f"'{around['type']}' adds channels" in told[0] and "'pathreplay', takes its" in told[0]
+    assert read_limits(tested) == Limits(6 if "b" in own else 4, 5, False)
+    assert stateful(tested).options()["attach"] == attach
+    assert len(logged) == 1 and re.search(told, logged[0])
 
 
 def test_unbounded_paths_of_a_scene_are_not_those_of_ours() -> None:

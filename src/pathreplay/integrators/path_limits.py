@@ -11,14 +11,12 @@ import mitsuba as mi
 
 from pathreplay.integrators.path_integrator import UNBOUNDED
 from pathreplay.integrators.scene_facts import facts_of
-from pathreplay.integrators.stateful import stateful
-from pathreplay.transport.facts.nodes import nodes_of
+from pathreplay.integrators.stateful import light_path_plugin, stateful
+from pathreplay.transport.facts.nodes import children_of
 from pathreplay.types import Json
 
 DIRECT, DIRECT_DEPTH = "DirectIntegrator", 2
 """Class of an integrator without the property ``max_depth``, and the length of its paths."""
-LIGHT_PATHS = {"ParticleIntegrator": "pathreplay_particles", "ParticleTracerIntegrator": "ptracer"}
-"""Plugins that trace all light from the emitters, by class."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,13 @@ class Limits:
 
 def nested_in(integrator: mi.Integrator) -> list[mi.Integrator]:
     """Return the integrators that an integrator contains (Mitsuba's ``aov``, ``moment``)."""
-    return [node for node in nodes_of(integrator) if isinstance(node, mi.Integrator)]
+    return [child for child in children_of(integrator).values() if isinstance(child, mi.Integrator)]
+
+
+def without_channels(integrator: mi.Integrator) -> mi.Integrator:
+    """Return the integrator inside of integrators that contain a single one; others are returned unchanged."""
+    inner = nested_in(integrator)
+    return without_channels(inner[0]) if len(inner) == 1 else integrator
 
 
 def read_limits(integrator: mi.Integrator) -> Limits | None:
@@ -41,9 +45,10 @@ def read_limits(integrator: mi.Integrator) -> Limits | None:
     The limits of an integrator that contains another one (Mitsuba's ``aov``, ``moment``) are those of the other one.
     """
     known = isinstance(integrator, mi.Integrator)  # callers may not have checked what a user has given
-    inner = nested_in(integrator) if known else []
-    if inner:
-        return read_limits(inner[0]) if len(inner) == 1 else None
+    if known:
+        integrator = without_channels(integrator)
+        if nested_in(integrator):
+            return None
     # Python integrators have attributes; C++ integrators only print the values.
     printed = dict(re.findall(r"(max_depth|rr_depth) = (-?\d+)", str(integrator)))
     if known and integrator.class_name() == DIRECT:
@@ -62,14 +67,15 @@ def counterpart(integrator: mi.Integrator, scene: mi.Scene) -> Json | None:
 
     It is Mitsuba's `path`, or `volpath` with media. These find no caustic of a light without extent, and `ptracer`
     leaves out media, and light at the border of the film. Integrators with light paths are therefore their own
-    counterparts.
+    counterparts. An integrator that contains another one (``aov``, ``moment``) has the counterpart of the other one.
     """
     limits = read_limits(integrator)
     if limits is None:
         return None
+    integrator = without_channels(integrator)
     if stateful(integrator).options().get("caustics") != "particles":
         return {"type": "volpath" if facts_of(scene).has_media else "path", **vars(limits)}
-    name = LIGHT_PATHS.get(type(integrator).__name__, LIGHT_PATHS.get(integrator.class_name()))
+    name = light_path_plugin(integrator)
     return {"type": name, **vars(limits)} if name else {"type": "pathreplay", "caustics": "particles", **vars(limits)}
 
 

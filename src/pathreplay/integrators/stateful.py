@@ -20,8 +20,10 @@ _RECORDABLE = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
 """Classes of Mitsuba's integrators that `dr.freeze` can record."""
 _PROJECTIVE = "Projective"
 """Substring in the class names of Mitsuba's integrators that estimate boundary terms."""
-_PTRACER = "ParticleTracerIntegrator"
-"""Class of Mitsuba's `ptracer`."""
+PARTICLES = "pathreplay_particles"
+PTRACER = "ptracer"
+_LIGHT_PATHS = {"ParticleIntegrator": PARTICLES, "ParticleTracerIntegrator": PTRACER}
+"""Plugins that trace all light from the emitters, by class."""
 
 
 @runtime_checkable
@@ -127,7 +129,7 @@ class Stateless(Unlearned):
         """Do nothing, since no notes are logged."""
 
     def options(self) -> Json:
-        return {"caustics": "particles"} if self.integrator.class_name() == _PTRACER else {}
+        return {"caustics": "particles"} if light_path_plugin(self.integrator) else {}
 
     def is_recordable(self, has_media: bool) -> bool:
         return self._kind in _RECORDABLE and not has_media
@@ -158,6 +160,12 @@ class Stateless(Unlearned):
             params = mi.traverse(view.scene)
             self.integrator.render_backward(view.scene, params, grad_in, view.sensor, view.seed, view.spp)
         return state
+
+
+def light_path_plugin(integrator: mi.Integrator) -> str | None:
+    """Return the name of an integrator that traces all light from the emitters; None for other integrators."""
+    # For Python plugins Mitsuba's class_name() returns the name of the C++ base class.
+    return _LIGHT_PATHS.get(type(integrator).__name__, _LIGHT_PATHS.get(integrator.class_name()))
 
 
 def stateful(integrator: mi.Integrator) -> StatefulIntegrator:

@@ -17,7 +17,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.scene_facts import facts_of
-from pathreplay.integrators.stateful import stateful
+from pathreplay.integrators.stateful import light_path_plugin, stateful
 from pathreplay.platform.owned_arrays import with_space
 from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.parameters import SceneValue, get_array
@@ -204,6 +204,6 @@ def integrator_name(integrator: mi.Integrator) -> str:
     # For Python plugins Mitsuba's class_name() returns the name of the C++ base class.
     name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     name = name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()
-    name = {"particle": "pathreplay_particles", "particletracer": "ptracer"}.get(name, name)
+    name = light_path_plugin(integrator) or name
     edges = stateful(integrator).options().get("boundary", "auto")
     return name if edges == "auto" else f"{name}, boundary {edges}"

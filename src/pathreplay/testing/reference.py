@@ -12,8 +12,14 @@ from typing import TypeAlias
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.integrators.path_limits import counterpart, nested_in, read_limits, without_unbounded
-from pathreplay.integrators.stateful import stateful
+from pathreplay.integrators.path_limits import (
+    counterpart,
+    nested_in,
+    read_limits,
+    without_channels,
+    without_unbounded,
+)
+from pathreplay.integrators.stateful import PARTICLES, light_path_plugin, stateful
 from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.testing.objective import integrator_name
 
@@ -27,7 +33,6 @@ LONGEST_WITHOUT_ROULETTE = 64
 """Largest ``max_depth`` at which the reference disables Russian roulette. Without roulette, paths in a closed room end
 only at ``max_depth``."""
 
-PARTICLES = "pathreplay_particles"
 _OURS = ("pathreplay", PARTICLES)
 """Our plugins, which have the properties ``boundary`` and ``boundary_spp``."""
 
@@ -46,7 +51,7 @@ def integrator_under_test(
     integrator. ``boundary`` contains additional properties (``boundary``, ``boundary_spp``). With ``boundary``, None
     selects the scene's own integrator if it has these properties, else ``pathreplay``. If the scene's own integrator is
     selected, it keeps its other properties. If the scene's own integrator adds channels to the image (``aov``), the
-    integrator inside of it takes its place, and a warning says so.
+    integrator inside of it takes its place, and a warning says that the channels are not checked.
 
     Raises PathreplayError if Mitsuba cannot create the integrator, if ``max_depth`` is invalid or given with an object,
     if the other properties of the scene's own integrator cannot be read to replace its ``max_depth``, or if boundary
@@ -54,8 +59,17 @@ def integrator_under_test(
     """
     if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
         raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
-    own = _without_channels(scene.integrator(), tell=spec is None)
-    if spec is None and max_depth is None and not boundary and isinstance(own, mi.CppADIntegrator):
+    whole = scene.integrator()
+    own = None if whole is None else without_channels(whole)
+    unchanged = max_depth is None and not boundary and isinstance(own, mi.CppADIntegrator)
+    if spec is None and whole is not None and nested_in(whole):
+        tested = f": '{integrator_name(own)}' inside of it is" if unchanged else ""
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"pathreplay: the scene's integrator '{integrator_name(whole)}' adds channels to the image, which are not "
+            f"checked{tested}",
+        )
+    if spec is None and unchanged:
         return own
     if isinstance(spec, mi.Integrator):
         if max_depth is not None or boundary:
@@ -85,20 +99,6 @@ def integrator_under_test(
     return load_integrator(description | dict(boundary or {}))
 
 
-def _without_channels(own: mi.Integrator | None, tell: bool) -> mi.Integrator | None:
-    """Return the integrator inside of one that adds channels to the image (`aov`, `moment`), or else ``own``."""
-    inner = nested_in(own) if own is not None and own.aov_names() else []
-    if own is None or len(inner) != 1:
-        return own
-    if tell:
-        mi.Log(
-            mi.LogLevel.Warn,
-            f"pathreplay: the scene's integrator '{integrator_name(own)}' adds channels to the image, which are not "
-            f"checked: the integrator inside of it, '{integrator_name(inner[0])}', takes its place",
-        )
-    return inner[0]
-
-
 def _own_name(own: mi.Integrator | None, has_boundary: bool) -> str:
     """Return the plugin that continues the scene's own integrator with other properties.
 
@@ -107,7 +107,7 @@ def _own_name(own: mi.Integrator | None, has_boundary: bool) -> str:
     """
     name = type(own).__name__
     if own is not None and stateful(own).options():
-        return PARTICLES if name == "ParticleIntegrator" else "pathreplay"
+        return PARTICLES if light_path_plugin(own) == PARTICLES else "pathreplay"
     if has_boundary or not isinstance(own, mi.CppADIntegrator):
         return "pathreplay"
     if name not in _ONLY_LIMITS:
@@ -133,7 +133,7 @@ def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> 
     if len(more.aov_names()) != len(fewer.aov_names()):
         raise PathreplayError(
             f"Integrator '{integrator_name(more)}' adds channels to the image, which '{integrator_name(fewer)}' lacks: "
-            "pass the integrator inside of it, or a reference with the same channels"
+            "pass the integrator inside of it, or a reference with as many channels"
         )
     return reference
 
@@ -142,14 +142,14 @@ def _described(spec: Mapping[str, object] | str | None, scene: mi.Scene, tested:
     """Return the description of the reference: see `reference_integrator`."""
     if isinstance(spec, Mapping):
         return dict(spec)
-    limits, plain = read_limits(tested), counterpart(tested, scene)
-    if limits is None or plain is None:
+    limits = read_limits(tested)
+    if limits is None:
         raise PathreplayError(
             f"Integrator {type(tested).__name__} does not expose its max_depth; pass a reference integrator that "
             "computes the same image, for example reference={'type': 'path', 'max_depth': 6}"
         )
-    if spec is not None:
-        plain = {"type": spec, **vars(limits)}
+    plain = counterpart(tested, scene) if spec is None else {"type": spec, **vars(limits)}
+    assert plain is not None  # only an integrator without limits has no counterpart
     if 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE:
         plain["rr_depth"] = NO_ROULETTE
     return plain

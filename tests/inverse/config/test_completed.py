@@ -46,6 +46,13 @@ def problem(own: str = "prb", options: str = "", **changes: Any) -> Problem:
     return build_problem(make_config({**JOB, **changes}), Path.cwd())
 
 
+def problem_of(own: str, options: str) -> Problem:
+    """The problem of a scene whose integrator has these properties only."""
+    scene = re.sub("<integrator.*</integrator>", f'<integrator type="{own}">{options}</integrator>', SCENE, flags=re.S)
+    Path("scene.xml").write_text(scene)
+    return build_problem(make_config(JOB), Path.cwd())
+
+
 def rendered(problem: Problem, **options: Any) -> np.ndarray:
     """An image of the scene by `path`; its random numbers are not those of the target."""
     integrator = mi.load_dict({"type": "path", **options})
@@ -68,6 +75,7 @@ def test_targets_of_light_paths_have_their_caustics(own: str, given: dict[str, s
     """`path` finds no caustic of a light without extent: a target by `path` would be black there."""
     found = problem(own, **({"integrator": given} if given else {}), sensors=["cam"])
     assert stateful(found.integrator).options()["caustics"] == "particles"
+    assert stateful(found.judge).options()["caustics"] == "particles"
     assert integrator_name(found.judge) == integrator_name(found.integrator)
     assert read_limits(found.judge) == read_limits(found.integrator)
 
@@ -82,10 +90,18 @@ NESTED = f'<integrator type="path"><integer name="max_depth" value="3"/>{HIDDEN}
 )
 def test_limits_of_integrators_without_limits_of_their_own(own: str, options: str, depth: int) -> None:
     """Paths of `direct` have at most two segments. The limits of `aov` are those of the integrator that it contains."""
-    scene = re.sub("<integrator.*</integrator>", f'<integrator type="{own}">{options}</integrator>', SCENE, flags=re.S)
-    Path("scene.xml").write_text(scene)
-    found = build_problem(make_config(JOB), Path.cwd())
+    found = problem_of(own, options)
     assert read_limits(found.integrator) == read_limits(found.judge) == Limits(depth, 5, True)
+
+
+def test_options_of_an_integrator_inside_of_others_are_those_of_the_job() -> None:
+    """Otherwise a job about caustics would have none, neither in its images nor in its targets."""
+    ours = """<integrator type="moment"><integrator type="pathreplay"><string name="caustics" value="particles"/>
+      <integer name="max_depth" value="4"/></integrator></integrator>"""
+    found = problem_of("aov", f'<string name="aovs" value="z:depth"/>{ours}')
+    for integrator in (found.integrator, found.judge):
+        assert stateful(integrator).options()["caustics"] == "particles"
+        assert read_limits(integrator) == Limits(4, 5, False)
 
 
 def test_a_scene_without_a_bound_leaves_the_job_the_default_depth() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from pathreplay.integrators.path_limits import Limits, counterpart, read_limits, without_unbounded
+from pathreplay.integrators.path_limits import Limits, counterpart, read_limits, without_channels, without_unbounded
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.tables import Plugin
@@ -49,7 +49,7 @@ def _options(own: mi.Integrator | None) -> Json:
     limits = None if own is None else read_limits(own)
     if own is None or limits is None:
         return {}
-    options = stateful(own).options()
+    options = stateful(without_channels(own)).options()
     return (vars(limits) if "adjoint" in options else without_unbounded(limits)) | options
 
 
