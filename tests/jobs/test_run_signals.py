@@ -8,6 +8,9 @@ import pty
 import signal
 import sys
 import time
+import weakref
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -114,6 +117,30 @@ def test_handlers_come_back_and_scheduler_signals_may_come_twice() -> None:
             signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)  # at once after the other: one wish
     assert before == {number: signal.getsignal(number) for number in interrupts.ENDING}
+
+
+@pytest.mark.parametrize("block", [interrupts.raised, lambda: stopping(lambda text: None, "out")])
+def test_a_signal_within_a_callback_of_a_weak_reference_ends_the_block(
+    block: Callable[[], AbstractContextManager[object]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python ignores the exception there, prints a traceback, and goes on: the command would end with status 0."""
+    before = {number: signal.getsignal(number) for number in interrupts.ENDING}
+    monkeypatch.setattr(interrupts, "_raised_at", [])
+    told: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    lost = set()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            with block():
+                if block is not interrupts.raised:
+                    signal.raise_signal(signal.SIGINT)  # requests a stop; only the next one aborts
+                watch = weakref.ref(lost, lambda _: signal.raise_signal(signal.SIGINT))
+                del lost
+                assert watch() is None
+        assert not told and sys.unraisablehook == told.append
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (1, 2, 0), (2, 0, 1)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -75,6 +76,9 @@ def handled(
     If the parent process ignores SIGTERM or SIGHUP (nohup), this process also ignores the signal. The previous handlers
     are restored at the end of the block, unless ``keep`` returns True because the process is about to exit. Several
     blocks can end in any order; signals call the handler of the block that was entered last.
+
+    Python ignores an exception of ``handle`` if the signal arrives within a destructor or a callback of a weak
+    reference. An ignored KeyboardInterrupt is raised again at the normal end of the block.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can set handlers
@@ -82,15 +86,29 @@ def handled(
     known = {number: signal.getsignal(number) for number in ENDING}
     before = {n: old for n, old in known.items() if old is not None and (n == signal.SIGINT or old != signal.SIG_IGN)}
     block = _Block(handle, before)
+    hook = sys.unraisablehook
+    ignored: list[BaseException] = []
+
+    def keep_ignored(args: sys.UnraisableHookArgs) -> None:
+        if block in _blocks and isinstance(args.exc_value, KeyboardInterrupt):
+            ignored.append(args.exc_value.with_traceback(None))
+        else:
+            hook(args)
+
     _blocks.append(block)
+    sys.unraisablehook = keep_ignored
     try:
         for number in before:
             signal.signal(number, handle)
         yield
     finally:
         _blocks.remove(block)
+        if sys.unraisablehook is keep_ignored:
+            sys.unraisablehook = hook
         if not keep():
             block.restore()
+    if ignored:
+        raise ignored[0]
 
 
 @contextmanager
