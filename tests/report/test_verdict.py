@@ -13,7 +13,7 @@ from pathreplay.inverse.config.schedules import rate
 from pathreplay.inverse.loop.loop import new_run
 from pathreplay.inverse.loop.movement import MOST_PARTS, SHORTEST, parts_of, still_moves
 from pathreplay.inverse.loop.trade_offs import columns_of, trade_offs
-from pathreplay.inverse.loop.verdict import Verdict
+from pathreplay.inverse.loop.verdict import Verdict, verdict_of
 from pathreplay.inverse.problem.problem import build_problem
 from pathreplay.jobs import make_config, optimize
 
@@ -173,6 +173,19 @@ def test_a_run_says_what_came_of_its_values(case: str, tmp_path: Path, monkeypat
     assert str(verdict)[1:].replace("'", "&#39;") in result.report.read_text()
 
 
+def test_a_parameter_that_the_last_stage_freezes_is_named_as_untested(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(SCENE)
+    job = {
+        "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 1}, "iterations": 2 * SHORTEST,
+        "integrator": {"type": "pathreplay", "max_depth": 2}, "parameters": [{"key": PAINT}, {"key": LAMP}],
+    }  # fmt: skip
+    problem = build_problem(make_config(job), tmp_path)
+    run = new_run(problem, problem.integrator)
+    run.history += [SimpleNamespace(slopes={PAINT: [(-1.0) ** n]}, means={PAINT: [float(n)]}) for n in range(40)]
+    verdict = verdict_of(problem, run, stopped=True)
+    assert (verdict.arrived, verdict.untested) == ((PAINT,), (LAMP,))
+
+
 @pytest.mark.parametrize("floor", [False, True])
 def test_what_moves_together_is_told_apart_by_what_stands_still(
     floor: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -208,4 +221,10 @@ def test_a_verdict_is_one_line_that_names_what_to_do() -> None:
             True,
             False,
         ]
+    assert str(Verdict(arrived=("a",), untested=("b",))).endswith("improve them; too few iterations to test: 'b'")
+    assert "noise: 'a': " in str(Verdict(arrived=("a",), untested=("b",)))
+    assert str(Verdict(("a",), untested=("b", "c"), unseen=("c",))).endswith(
+        "oscillate; too few iterations to test: 'b'"
+    )
+    assert str(Verdict(untested=("a",))) == str(Verdict())
     assert str(Verdict()) == "values: fewer than 20 iterations, too few to test convergence"

@@ -17,10 +17,7 @@ from pathreplay.inverse.problem.problem import Problem
 
 @dataclass(frozen=True)
 class Verdict:
-    """Keys of variables, grouped by state.
-
-    If a variable is in none of the groups, the run had too few iterations to test whether the variable still moves.
-    """
+    """Keys of variables, grouped by state."""
 
     moving: tuple[str, ...] = ()
     """Variables that still move."""
@@ -30,6 +27,8 @@ class Verdict:
     """Pairs of variables whose effects on the images cancel."""
     unseen: tuple[str, ...] = ()
     """Variables that do not affect the images."""
+    untested: tuple[str, ...] = ()
+    """Variables with too few iterations, in the last stage and at the last resolution, to test whether they move."""
     searches: bool = False
     """Whether the optimiser has no learning rate (see `Optimizer.searches`)."""
 
@@ -48,10 +47,13 @@ class Verdict:
             faster = "" if self.searches else ", or raise learning_rate if they do not oscillate"
             parts.append(f"still moving: {_listed(self.moving)}: run more iterations{faster}")
         free = {key for pair in self.trade_offs for key in pair} | set(self.unseen)
+        untested = [key for key in self.untested if key not in free]
         if arrived := [key for key in self.arrived if key not in free]:
-            which = _listed(arrived) if parts else "all"
+            which = _listed(arrived) if parts or untested else "all"
             remedy = "raise spp" if self.searches else "raise spp or let the learning rate decay"
             parts.append(f"converged up to noise: {which}: {remedy} to improve them")
+        if parts and untested:
+            parts.append(f"too few iterations to test: {_listed(untested)}")
         return "values: " + ("; ".join(parts) or f"fewer than {SHORTEST} iterations, too few to test convergence")
 
 
@@ -71,7 +73,8 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     done = bool(run.optimiser.finished)
     moving = tuple(key for key in known if moves[key] and not done)
     arrived = tuple(key for key in known if key not in moving)
-    verdict = Verdict(moving, arrived, searches=problem.config.optimizer.searches)
+    untested = tuple(key for key, moving in moves.items() if moving is None)
+    verdict = Verdict(moving, arrived, untested=untested, searches=problem.config.optimizer.searches)
     if stopped or not known:
         return verdict
     pixels = np.mean([view.target[..., 0].size for view in problem.trained().values()])
