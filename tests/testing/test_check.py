@@ -274,6 +274,17 @@ def test_channels_that_a_scenes_own_integrator_adds_are_not_checked_and_named(
     assert len(logged) == 1 and re.search(told, logged[0])
 
 
+@pytest.mark.parametrize(("light", "notes"), [("constant", 1), ("point", 0)])
+def test_a_check_tells_that_ptracer_does_not_expose_hidden_emitters(
+    light: str, notes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logged: list[str] = []
+    monkeypatch.setattr("pathreplay.testing.reference.mi.Log", lambda _, text: logged.append(text))
+    own = {"type": "ptracer", "hide_emitters": True}
+    integrator_under_test(None, mi.load_dict({"type": "scene", "integrator": own, "light": {"type": light}}))
+    assert len(logged) == notes and all("'ptracer' does not expose its hide_emitters" in text for text in logged)
+
+
 def test_unbounded_paths_of_a_scene_are_not_those_of_ours() -> None:
     """As in a job. Unbounded paths are the default of `path`, rarely intended, and cannot be recorded."""
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "rr_depth": 7, "hide_emitters": True}})

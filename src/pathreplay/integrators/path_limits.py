@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from pathreplay.integrators.path_integrator import UNBOUNDED
 from pathreplay.integrators.scene_facts import facts_of
-from pathreplay.integrators.stateful import light_path_plugin, stateful
+from pathreplay.integrators.stateful import PTRACER, light_path_plugin, stateful
 from pathreplay.transport.facts.nodes import children_of
 from pathreplay.types import Json
 
@@ -77,6 +77,17 @@ def counterpart(integrator: mi.Integrator, scene: mi.Scene) -> Json | None:
         return {"type": "volpath" if facts_of(scene).has_media else "path", **vars(limits)}
     name = light_path_plugin(integrator)
     return {"type": name, **vars(limits)} if name else {"type": "pathreplay", "caustics": "particles", **vars(limits)}
+
+
+def notes_on_visibility(integrator: mi.Integrator, scene: mi.Scene) -> tuple[str, ...]:
+    """Return a note if emitters could be seen, but the scene's integrator does not tell whether it hides them."""
+    lights = (light for light in scene.emitters() if not mi.has_flag(light.flags(), mi.EmitterFlags.Delta))
+    if light_path_plugin(without_channels(integrator)) != PTRACER or next(lights, None) is None:
+        return ()
+    return (
+        "the scene's 'ptracer' does not expose its hide_emitters, so emitters are taken as visible; to hide them, give "
+        "the integrator 'pathreplay' with caustics = 'particles', the max_depth of the scene, and hide_emitters = true",
+    )
 
 
 def without_unbounded(limits: Limits) -> dict[str, int]:

@@ -15,6 +15,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.path_limits import (
     counterpart,
     nested_in,
+    notes_on_visibility,
     read_limits,
     without_channels,
     without_unbounded,
@@ -79,6 +80,8 @@ def integrator_under_test(
     if isinstance(spec, Mapping):
         description = dict(spec)
     else:
+        for note in () if own is None else notes_on_visibility(own, scene):
+            mi.Log(mi.LogLevel.Warn, f"pathreplay: {note}")
         limits = None if own is None else read_limits(own)
         name = spec or _own_name(own, bool(boundary))
         options = {} if own is None or name not in _OURS else stateful(own).options()

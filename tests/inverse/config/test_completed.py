@@ -145,6 +145,15 @@ def test_targets_of_a_scene_with_media_are_rendered_with_them() -> None:
     assert judge.class_name().startswith("Volumetric") and read_limits(judge) is not None
 
 
+def test_a_ptracer_of_the_scene_does_not_tell_whether_it_hides_emitters() -> None:
+    """It exposes no such property. Its description does, in a job."""
+    (note,) = problem("ptracer").notes
+    assert "'ptracer' does not expose its hide_emitters" in note and "hide_emitters = true" in note
+    ours = {"type": "pathreplay", "max_depth": 2, "caustics": "particles", "hide_emitters": True}
+    theirs = {**JOB["target"], "integrator": {"type": "ptracer", "max_depth": 2, "hide_emitters": True}}
+    assert not problem("ptracer", integrator=ours, target=theirs).notes
+
+
 def test_a_run_is_exported_with_the_depth_that_it_had() -> None:
     from pathreplay.jobs import optimize
 

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mitsuba as mi
 
-from pathreplay.integrators.path_limits import Limits, counterpart, read_limits, without_channels, without_unbounded
+from pathreplay.integrators.path_limits import (
+    Limits,
+    counterpart,
+    notes_on_visibility,
+    read_limits,
+    without_channels,
+    without_unbounded,
+)
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.tables import Plugin
@@ -27,21 +36,40 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
         own: integrator object that takes the place of the job's integrator.
 
     Returns:
-        The completed job, and a note if the integrators of job and targets have different limits.
+        The completed job, and notes: the scene does not tell whether emitters are visible, or the integrators of job
+        and targets have different limits.
 
     Raises:
         PathreplayError: an integrator cannot be created.
     """
+    notes: tuple[str, ...] = ()
     if "integrator" not in config.model_fields_set and (options := _options(scene.integrator())):
         config = config.model_copy(update={"integrator": Plugin(type="pathreplay", **options)})
+        shown = scene.integrator()
+        if own is None and shown is not None:
+            notes = notes_on_visibility(shown, scene)
     if config.brings_pictures:
-        return config, ()
+        return config, notes
     ours = load_integrator(config.integrator.model_dump()) if own is None else own
     asked = config.target.integrator
     if asked is not None:
-        return config, _differences(read_limits(ours), read_limits(load_integrator(asked.model_dump())), config)
+        return config, notes + _differences(read_limits(ours), _limits(asked), config)
+    return with_default_target(config, ours, scene), notes
+
+
+def with_default_target(config: Config, ours: mi.Integrator, scene: mi.Scene) -> Config:
+    """Let the `counterpart` of the job's integrator render the targets from a scene."""
     plugin = Plugin(**(counterpart(ours, scene) or {"type": "path", "max_depth": 6}))
-    return config.model_copy(update={"target": config.target.model_copy(update={"integrator": plugin})}), ()
+    return config.model_copy(update={"target": config.target.model_copy(update={"integrator": plugin})})
+
+
+def _limits(plugin: Plugin) -> Limits | None:
+    """Return the limits of a plugin. Mitsuba's `ptracer` does not expose its ``hide_emitters``."""
+    description = plugin.model_dump()
+    limits = read_limits(load_integrator(description))
+    if limits is None:
+        return None
+    return replace(limits, hide_emitters=bool(description.get("hide_emitters", limits.hide_emitters)))
 
 
 def _options(own: mi.Integrator | None) -> Json:
