@@ -145,6 +145,22 @@ def test_targets_of_a_scene_with_media_are_rendered_with_them() -> None:
     assert judge.class_name().startswith("Volumetric") and read_limits(judge) is not None
 
 
+def test_the_target_scene_decides_whether_targets_are_rendered_with_media() -> None:
+    """The scene of the job has none. `path` takes the border of a medium for black."""
+    fog = """<shape type="cube"><transform name="to_world"><translate z="-2"/></transform><bsdf type="null"/>
+      <medium type="homogeneous" name="interior"/></shape></scene>"""
+    Path("fog.xml").write_text(SCENE.format(integrator="path", options="").replace("</scene>", fog))
+    found = problem("path", target={"scene": "fog.xml", "spp": 1})
+    assert found.judge.class_name().startswith("Volumetric") and found.config.target.integrator.type == "volpath"
+    assert found.views[0].target.any() and not found.notes
+
+
+def test_black_targets_are_told_in_one_line() -> None:
+    found = problem("path", target={**JOB["target"], "values": {"*.radiance.value": 0.0}})
+    (note,) = found.notes
+    assert note.startswith("the target of view 'cam' is black: ") and "\n" not in note
+
+
 def test_a_ptracer_of_the_scene_does_not_tell_whether_it_hides_emitters() -> None:
     """It exposes no such property. Its description does, in a job."""
     (note,) = problem("ptracer").notes

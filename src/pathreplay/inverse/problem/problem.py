@@ -57,7 +57,7 @@ from pathreplay.inverse.parameters.response import start as start_of_response
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import Variable, free_of, keys_of, make_variables
 from pathreplay.inverse.problem import feasibility
-from pathreplay.inverse.problem.completed import completed
+from pathreplay.inverse.problem.completed import completed, with_default_target
 from pathreplay.platform import memory
 from pathreplay.platform.owned_arrays import owned
 from pathreplay.platform.threads import one_thread
@@ -280,6 +280,7 @@ def build_problem(
     loss = find_loss(config.loss, modules)
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
+    default_target = config.target.integrator is None
     scene, config, notes = _loaded(config, base, shots, given)
     params = traversed(scene)
     parameters.require_finite(params)
@@ -295,7 +296,6 @@ def build_problem(
     if baseline is not None:
         keys_of(params, config.parameters, config.derived, baseline)
         notes_on_edges(params, keys, baseline)  # only suppresses the note that the baseline would log
-    judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     # Cheap checks come before the rendering of targets.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
     used = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
@@ -312,9 +312,10 @@ def build_problem(
     unsolved, unsolved_poses = make_variables(scene, params, entries, base, modules, given.starts, bounded)
     derived = make_derived(params, derivations, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
-    opened = _Opened(scene, params, keys, sensors, integrator)
-    targets, truth, messages = _seen(config, targets, used, opened, base, disk)
+    opened = _Opened(scene, params, keys, sensors, integrator, default_target)
+    config, targets, truth, messages = _seen(config, targets, used, opened, base, disk)
     notes += messages
+    judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target image of sensor '{missing.pop()}'; start a new run")
     masked_all = config.target.masks is not None or config.target.alpha == "mask"
@@ -332,8 +333,7 @@ def build_problem(
     variables = tuple(_kept(disk, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in unsolved_poses)
     derived = tuple(replace(entry, truth=truth.get(entry.key)) for entry in derived)
-    # `update` requires that all keys that were read from `params` still exist, but `keep_only` removes some of them.
-    # Traverse the scene again: no key of the new `params` has been read.
+    # Traverse the scene again, because `update` requires all keys that were read, and `keep_only` removes some of them.
     params = traversed(scene)
     parameters.keep_only(params, keys)
     digest = fingerprint(used.values()) if used else None
@@ -367,19 +367,27 @@ def _loaded(
 
 @dataclass(frozen=True)
 class _Opened:
-    """The scene of a job, the parameters that the job recovers, and the index of the sensor of each view."""
+    """The scene of a job, the parameters that the job recovers, and the index of the sensor of each view.
+
+    ``default_target`` says that the job does not choose the integrator of its targets.
+    """
 
     scene: mi.Scene
     params: mi.SceneParameters
     keys: list[str]
     sensors: dict[str, int]
     integrator: mi.Integrator
+    default_target: bool
 
 
 def _seen(
     config: Config, targets: Targets | None, shots: Mapping[str, Shot], opened: _Opened, base: Path, disk: DiskStore
-) -> tuple[Targets, dict[str, Array], tuple[str, ...]]:
-    """Read or render the targets if none are given. Returns targets, true values by key, and notes for the user."""
+) -> tuple[Config, Targets, dict[str, Array], tuple[str, ...]]:
+    """Read or render the targets if none are given.
+
+    Returns the job, whose default integrator of targets suits the target scene, targets, true values by key, and notes
+    for the user.
+    """
     truth: dict[str, Array] = {}
     notes: tuple[str, ...] = ()
     first = targets is None
@@ -387,10 +395,13 @@ def _seen(
         wanted = [entry.key for entry in config.parameters] + [entry.key for entry in config.derived]
         other = target_scene(*config.target_source, config.target.values, wanted, base)
         truth = truth_of(other, opened.params, opened.keys)
+        if opened.default_target:
+            config = with_default_target(config, opened.integrator, other)
         if targets is None:
             with one_thread(config.deterministic):
                 seeds = {name: config.seeds(TARGET, index)[0] for name, index in opened.sensors.items()}
                 targets = Targets(rendered_targets(config.target, seeds, other, opened.sensors, disk), {})
+            notes = _notes_on_black(targets)
         # Dr.Jit traces virtual calls through all live instances, so a live target scene would enlarge every kernel.
         del other
         gc.collect()
@@ -400,7 +411,18 @@ def _seen(
         masks = by_view("masks", config.target.masks, opened.sensors, base)
         how = Reading(config.target.alpha)
         targets = masked(targets, read_masks(masks, how, opened.scene, opened.sensors, base))
-    return targets, truth, notes
+    return config, targets, truth, notes
+
+
+def _notes_on_black(targets: Targets) -> tuple[str, ...]:
+    black = [name for name, image in targets.images.items() if not np.any(image)]
+    if not black:
+        return ()
+    more = f" (and of {len(black) - 1} more)" if len(black) > 1 else ""
+    return (
+        f"the target of view '{black[0]}'{more} is black: the target scene shows no light there; check its emitters, "
+        "sensors and max_depth",
+    )
 
 
 def _kept(disk: DiskStore, variable: Variable) -> Variable:
