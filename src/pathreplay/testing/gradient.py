@@ -1,4 +1,4 @@
-"""Gradient checks: the derivative of any integrator against finite differences of images by a plain path tracer.
+"""Gradient checks: the derivative of any integrator against finite differences of images of the same expectation.
 
 Each check draws two sets of independent samples of one directional derivative, and derives standard errors and a
 verdict from them.
@@ -98,7 +98,7 @@ def check_gradient(  # noqa: PLR0913 (most are keyword-only)
             own integrator if it is differentiable, else ``pathreplay``. A plugin given by name gets the path limits of
             the scene's integrator.
         reference: the integrator whose images are differenced; None for Mitsuba's ``path`` (``volpath`` with media)
-            with the same path limits.
+            with the same path limits. If ``integrator`` traces light paths, None selects an integrator of its kind.
         max_depth: path length, if ``integrator`` is None or a name.
         sensor: index of the sensor; its film determines the resolution.
         seeds: number n of independent seeds for the gradient; the reference uses n other seeds.

@@ -29,8 +29,8 @@ class Target(Table):
     values: dict[str, Value] = Field(default_factory=dict)
     """Values of parameters of the target scene, in place of the values in its file."""
     integrator: Plugin | None = None
-    """Integrator that renders the targets. Default: path (volpath in scenes with media), with max_depth, rr_depth and
-    hide_emitters of the job's integrator."""
+    """Integrator that renders the targets. Default: path (volpath if the target scene has media), with max_depth,
+    rr_depth and hide_emitters of the job's integrator; the job's integrator itself if it traces light paths."""
     spp: Count = 512
     """Samples per pixel of the targets."""
 
@@ -54,7 +54,7 @@ class Target(Table):
         if self.integrator is not None and self.integrator.type == "pathreplay" and not light_paths:
             raise ValueError(
                 "target: integrator 'pathreplay' would be compared with itself; render targets with another "
-                "integrator, such as 'path'"
+                "integrator, such as 'path', or with caustics = 'particles'"
             )
         return self
 
