@@ -18,6 +18,8 @@ ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
 # Interval in seconds within which several signals count as one, so that a second signal does not interrupt the reaction
 # to the first signal.
 ONE_WISH_S = 1.0
+SOON_S = 0.05
+"""Seconds after which a signal is repeated if Python has ignored the exception of its handler: see `handled`."""
 
 _raised_at: list[float] = []  # time at which a signal handler last raised an exception
 
@@ -65,6 +67,24 @@ class _Block:
 
 
 _blocks: list[_Block] = []  # the active blocks; blocks of generators can end in any order
+_hooks: list[Callable[[sys.UnraisableHookArgs], object]] = []  # the hook that `_repeat` replaces during blocks
+
+
+def _repeat(args: sys.UnraisableHookArgs) -> None:
+    """Repeat the signal whose exception Python has ignored. Pass all other ignored exceptions on."""
+    if not isinstance(args.exc_value, KeyboardInterrupt):
+        _hooks[0](args)
+        return
+    number = args.exc_value.number if isinstance(args.exc_value, Interrupted) else signal.SIGINT
+
+    def again() -> None:
+        _raised_at.clear()
+        if _blocks:
+            signal.raise_signal(number)
+
+    timer = threading.Timer(SOON_S, again)
+    timer.daemon = True
+    timer.start()
 
 
 @contextmanager
@@ -78,7 +98,7 @@ def handled(
     blocks can end in any order; signals call the handler of the block that was entered last.
 
     Python ignores an exception of ``handle`` if the signal arrives within a destructor or a callback of a weak
-    reference. An ignored KeyboardInterrupt is raised again at the normal end of the block.
+    reference. If the exception is a KeyboardInterrupt, the signal is repeated soon after, unless all blocks have ended.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can set handlers
@@ -86,29 +106,19 @@ def handled(
     known = {number: signal.getsignal(number) for number in ENDING}
     before = {n: old for n, old in known.items() if old is not None and (n == signal.SIGINT or old != signal.SIG_IGN)}
     block = _Block(handle, before)
-    hook = sys.unraisablehook
-    ignored: list[BaseException] = []
-
-    def keep_ignored(args: sys.UnraisableHookArgs) -> None:
-        if block in _blocks and isinstance(args.exc_value, KeyboardInterrupt):
-            ignored.append(args.exc_value.with_traceback(None))
-        else:
-            hook(args)
-
+    if not _blocks:
+        _hooks[:], sys.unraisablehook = [sys.unraisablehook], _repeat
     _blocks.append(block)
-    sys.unraisablehook = keep_ignored
     try:
         for number in before:
             signal.signal(number, handle)
         yield
     finally:
         _blocks.remove(block)
-        if sys.unraisablehook is keep_ignored:
-            sys.unraisablehook = hook
+        if not _blocks and sys.unraisablehook is _repeat:
+            sys.unraisablehook = _hooks[0]
         if not keep():
             block.restore()
-    if ignored:
-        raise ignored[0]
 
 
 @contextmanager
