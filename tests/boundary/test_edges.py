@@ -325,6 +325,12 @@ def test_a_medium_out_of_view_takes_no_edges_from_a_large_film() -> None:
     assert weights[1].sum() == pytest.approx(weights[0].sum(), rel=1e-2)
 
 
+def test_parts_of_a_search_draw_different_numbers() -> None:
+    mass = dr.ones(mi.Float, 1000)
+    one, same, other = (Resampled.of(mass, 50, mi.UInt32(1), first).index for first in (0, 0, 50))
+    assert dr.all(one == same) and dr.count(one == other)[0] < 25
+
+
 @pytest.mark.parametrize("name", ["shadow_occluder", pytest.param("indirect_rough", marks=pytest.mark.slow)])
 def test_a_search_in_parts_finds_as_much(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is proportional to the size of a part. Neither mean nor noise of a gradient depends on it."""

@@ -112,10 +112,10 @@ class PrimarySearch(FilmSearch[FilmSegment]):
     def guided(self, n: int, seed: mi.UInt32) -> PrimarySearch:
         """Refine the density with a pilot pass (see `EdgeSearch`). Pilot segments have twice the usual length."""
         wide, n_pilot = replace(self, length=2 * self.length), pilot_size(n, self.film.size)
-        pilot = wide.draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.PILOT.of(seed))
+        pilot = wide.draw(dr.arange(mi.UInt32, n_pilot), mi.UInt32(0), n_pilot, Stream.PILOT.of(seed))
         return replace(self, density=self.density.refined(pilot.c, wide.detect(pilot) * pilot.density))
 
-    def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> FilmSegment:
+    def draw(self, i: mi.UInt32, number: mi.UInt32, n: int, seed: mi.UInt32) -> FilmSegment:
         x, y, turn = quasi_random(i, n, seed, 3)
         c, density = self.density.draw(x, y)
         key = key_of(i, Stream.PRIMARY_KEYS.of(seed))

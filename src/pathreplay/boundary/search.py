@@ -1,9 +1,9 @@
 """Edge search, shared by all boundary terms: draw segments, detect edges, resample, bisect, weigh and record.
 
 Most segments cross no edge. A first kernel therefore probes all segments. Segments are then resampled by importance,
-and a second kernel bisects a fixed number of segments. The second kernel has the same number of lanes in every pass,
-and wastes none of them. A pilot pass with few segments determines the density of all other segments on the film. Many
-segments are searched in parts, because memory is proportional to the number of segments in a part.
+and a second kernel bisects a fixed number of segments, so that it wastes no lanes. A pilot pass with few segments
+determines the density of all other segments on the film. Many segments are searched in parts, because memory is
+proportional to the number of segments in a part.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ class EdgeSearch(ABC, Generic[Segments]):
     bisection: ClassVar[Stream]  # random stream for the choice among the crossings of one segment
 
     def find(self, n: int, closer: int, seed: mi.UInt32) -> Iterator[Edges]:
-        """Probe ``n`` segments, and resample one in ``closer`` by importance. Yield the edges of each part, detached.
+        """Probe ``n`` segments, resample n / ``closer`` of them by importance, and yield their edges, part by part.
 
-        A secondary search probes all segments of ``n`` paths instead. Each part takes one in several segments, because
+        A secondary search probes all segments of ``n`` paths instead. A part consists of every k-th segment, because
         consecutive segments are close to each other on the film.
         """
         search = self.guided(n, seed)
@@ -63,24 +63,24 @@ class EdgeSearch(ABC, Generic[Segments]):
             yield search._find_in(n, closer, seed, part, parts)
 
     def _find_in(self, n: int, closer: int, seed: mi.UInt32, part: int, parts: int) -> Edges:
-        count = len(range(part, n, parts))
+        count = len(range(part, n, parts))  # segments part, part + parts, part + 2 parts, ...
         lanes = max(count // closer, 1)
-        # Opaque: the kernels depend neither on the part nor on n.
+        # Opaque: the kernels do not depend on the part. ``lane`` is the number of the part's first lane.
         first, step, width, lane = (dr.opaque(mi.UInt32, x) for x in (part, parts, count, part * lanes))
-        importance = self.detect(self.draw(first + step * dr.arange(mi.UInt32, count), n, seed))
+        importance = self.detect(self.draw(first + step * dr.arange(mi.UInt32, count), mi.UInt32(0), n, seed))
         chosen = Resampled.of(importance, lanes, seed, lane)
         number = chosen.index // width
-        i = number * n + first + step * (chosen.index - number * width)
+        i = first + step * (chosen.index - number * width)
         generator = mi.PCG32(lanes, initstate=seed + int(self.bisection), initseq=lane + dr.arange(mi.UInt32, lanes))
-        return self.resolve(self.draw(i, n, seed), chosen.weight * dr.opaque(mi.Float, 1 / n), generator)
+        return self.resolve(self.draw(i, number, n, seed), chosen.weight * dr.opaque(mi.Float, 1 / n), generator)
 
     def guided(self, n: int, seed: mi.UInt32) -> EdgeSearch[Segments]:
         """Run a pilot pass, and return a search with a refined density. Without a pilot pass, return this search."""
         return self
 
     @abstractmethod
-    def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> Segments:
-        """Draw the i-th of n segments."""
+    def draw(self, i: mi.UInt32, number: mi.UInt32, n: int, seed: mi.UInt32) -> Segments:
+        """Draw the i-th of n segments. In secondary searches, draw a segment of the i-th path: see `CameraPath`."""
 
     @abstractmethod
     def detect(self, segments: Segments) -> mi.Float:
@@ -177,7 +177,7 @@ def _index_at(cdf: mi.Float64, x: mi.Float64 | mi.Float) -> mi.UInt32:
 
 
 def pilot_size(n: int, size: mi.ScalarVector2f) -> int:
-    """Return the number of pilot segments, for ``n`` segments on a film of ``size`` pixels."""
+    """Return the number of pilot segments, for ``n`` segments on a film of ``size`` pixels; at most `AT_ONCE`."""
     return max(min(n // PILOT_RATIO, PILOT_PER_PIXEL * int(size.x) * int(size.y), AT_ONCE), 1)
 
 

@@ -97,7 +97,8 @@ class SecondarySearch(EdgeSearch[CameraPath]):
             s, falls = cast_shadows(self.trace, shapes, self.film, Stream.CAST_SHADOWS.of(seed))
             density = density.refined(s, dr.select(falls, mi.Float(1), 0), UNGUIDED)
         n_pilot = pilot_size(n, self.film.size)
-        pilot = replace(self, density=density).draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.PILOT.of(seed))
+        search, i = replace(self, density=density), dr.arange(mi.UInt32, n_pilot)
+        pilot = search.draw(i, mi.UInt32(0), n_pilot, Stream.PILOT.of(seed))
         importances = self._importances(pilot)
         radiance = importances.radiance()
         importance = importances.weighed(radiance)[1]
@@ -114,15 +115,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
             radiance=radiance,
         )
 
-    def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
-        """Draw the path of segment ``i``: see `EdgeSearch`.
-
-        Indices below ``n`` denote segments in emitter squares. The following indices denote arcs: first one arc of each
-        path, then a second arc of each path, and so on. The segments with indices i, n + i, 2 n + i, ... belong to the
-        same path.
-        """
-        number = i // n
-        i = i - number * n
+    def draw(self, i: mi.UInt32, number: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
         s, density = self.density.draw(*quasi_random(i, n, seed))
         return CameraPath(s, density, key_of(i, Stream.SECONDARY_KEYS.of(seed)), number)
 
@@ -185,7 +178,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
 
     @dr.syntax
     def _detect_arcs(self, observer: ObserverVertex, path: CameraPath, n: int, found: Importance) -> None:
-        """Write the importance of all arcs of ``n`` paths to ``found``, in the order of `draw`.
+        """Write the importance of all arcs of ``n`` paths to ``found``, in the order of `Importances.arcs`.
 
         It is divided by the number of arcs around the vertex.
         """

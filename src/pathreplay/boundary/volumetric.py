@@ -85,7 +85,7 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
     def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> Self:
         return super().of(recordable(trace), film, length)
 
-    def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> BeamSegment:
+    def draw(self, i: mi.UInt32, number: mi.UInt32, n: int, seed: mi.UInt32) -> BeamSegment:
         key = key_of(i, Stream.VOLUMETRIC_KEYS.of(seed))
         sampler = CounterSampler.stream(key, Stream.BEAM)
         w = heading(sampler.next_1d())
@@ -372,7 +372,7 @@ class ScatteredBeamSearch(EdgeSearch[CameraPath]):
     def of(trace: TraceConfig, film: FilmDomain, length: float) -> ScatteredBeamSearch:
         return ScatteredBeamSearch(recordable(trace), film, SegmentDensity.uniform(film.size, 0.0), length)
 
-    def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
+    def draw(self, i: mi.UInt32, number: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
         s, density = self.density.draw(*quasi_random(i, n, Stream.SCATTERED_CENTRES.of(seed)))
         return CameraPath(s, density, key_of(i, Stream.SCATTERED_KEYS.of(seed)), mi.UInt32(1))
 
