@@ -227,4 +227,6 @@ def test_a_verdict_is_one_line_that_names_what_to_do() -> None:
         "oscillate; too few iterations to test: 'b'"
     )
     assert str(Verdict(untested=("a",))) == str(Verdict())
-    assert str(Verdict()) == "values: fewer than 20 iterations, too few to test convergence"
+    assert str(Verdict()) == (
+        "values: fewer than 20 iterations in the last stage or at the last resolution, too few to test convergence"
+    )

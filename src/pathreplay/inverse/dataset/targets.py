@@ -106,7 +106,7 @@ def rendered_targets(
 ) -> dict[str, Image]:
     """Render the targets of all views, each with its own seed. Raises PathreplayError if the scene lacks a sensor."""
     plugin = target.integrator
-    assert plugin is not None  # `completed` has filled in a missing integrator
+    assert plugin is not None  # `with_default_target` has filled in a missing integrator
     integrator = load_integrator(plugin.model_dump())
     if len(scene.sensors()) <= max(sensors.values()):
         raise PathreplayError(

@@ -54,7 +54,8 @@ class Verdict:
             parts.append(f"converged up to noise: {which}: {remedy} to improve them")
         if parts and untested:
             parts.append(f"too few iterations to test: {_listed(untested)}")
-        return "values: " + ("; ".join(parts) or f"fewer than {SHORTEST} iterations, too few to test convergence")
+        since = f"fewer than {SHORTEST} iterations in the last stage or at the last resolution"
+        return "values: " + ("; ".join(parts) or f"{since}, too few to test convergence")
 
 
 def _listed(keys: Sequence[str]) -> str:
@@ -73,7 +74,7 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     done = bool(run.optimiser.finished)
     moving = tuple(key for key in known if moves[key] and not done)
     arrived = tuple(key for key in known if key not in moving)
-    untested = tuple(key for key, moving in moves.items() if moving is None)
+    untested = tuple(key for key, moving in moves.items() if moving is None and not done)
     verdict = Verdict(moving, arrived, untested=untested, searches=problem.config.optimizer.searches)
     if stopped or not known:
         return verdict

@@ -1,4 +1,4 @@
-"""Derive the default integrator of a job from its scene, and the default integrator of targets from the job."""
+"""Derive the default integrator of a job from its scene, and the default integrator of targets from job and target."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ SHOWN = {"max_depth": "the length of paths", "hide_emitters": "whether emitters 
 
 
 def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None) -> tuple[Config, tuple[str, ...]]:
-    """Fill in the integrators that a job leaves out.
+    """Fill in the integrator of a job that leaves it out, and compare it with the integrator of the targets.
 
     The default integrator of a job is `pathreplay` with the options of the scene's integrator. The default integrator
-    of rendered targets is the `counterpart` of the job's integrator.
+    of rendered targets depends on the target scene: see `with_default_target`.
 
     Args:
         config: the job.
@@ -43,22 +43,22 @@ def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None)
         PathreplayError: an integrator cannot be created.
     """
     notes: tuple[str, ...] = ()
-    if "integrator" not in config.model_fields_set and (options := _options(scene.integrator())):
+    shown = scene.integrator()
+    if shown is not None and "integrator" not in config.model_fields_set and (options := _options(shown)):
         config = config.model_copy(update={"integrator": Plugin(type="pathreplay", **options)})
-        shown = scene.integrator()
-        if own is None and shown is not None:
+        if own is None:
             notes = notes_on_visibility(shown, scene)
-    if config.brings_pictures:
+    asked = config.target.integrator
+    if config.brings_pictures or asked is None:
         return config, notes
     ours = load_integrator(config.integrator.model_dump()) if own is None else own
-    asked = config.target.integrator
-    if asked is not None:
-        return config, notes + _differences(read_limits(ours), _limits(asked), config)
-    return with_default_target(config, ours, scene), notes
+    return config, notes + _differences(read_limits(ours), _limits(asked), config)
 
 
 def with_default_target(config: Config, ours: mi.Integrator, scene: mi.Scene) -> Config:
-    """Let the `counterpart` of the job's integrator render the targets from a scene."""
+    """Let the `counterpart` of the job's integrator render the targets from ``scene``, unless the job names another."""
+    if config.target.integrator is not None:
+        return config
     plugin = Plugin(**(counterpart(ours, scene) or {"type": "path", "max_depth": 6}))
     return config.model_copy(update={"target": config.target.model_copy(update={"integrator": plugin})})
 
@@ -72,10 +72,10 @@ def _limits(plugin: Plugin) -> Limits | None:
     return replace(limits, hide_emitters=bool(description.get("hide_emitters", limits.hide_emitters)))
 
 
-def _options(own: mi.Integrator | None) -> Json:
+def _options(own: mi.Integrator) -> Json:
     """Return options of `pathreplay` that match the scene's integrator, or none if its path limits are unknown."""
-    limits = None if own is None else read_limits(own)
-    if own is None or limits is None:
+    limits = read_limits(own)
+    if limits is None:
         return {}
     options = stateful(without_channels(own)).options()
     return (vars(limits) if "adjoint" in options else without_unbounded(limits)) | options

@@ -42,7 +42,7 @@ from pathreplay.inverse.dataset.targets import (
 from pathreplay.inverse.dataset.views import View, named_views, sensors_of, shares_of, test_views_of
 from pathreplay.inverse.images.background import require_known
 from pathreplay.inverse.images.disk_store import DiskStore
-from pathreplay.inverse.images.io import picture_size
+from pathreplay.inverse.images.io import colours_of, picture_size
 from pathreplay.inverse.losses.pixelwise import Loss, find_loss
 from pathreplay.inverse.parameters import limits as parameter_limits
 from pathreplay.inverse.parameters.derived import Derived, make_derived
@@ -280,7 +280,6 @@ def build_problem(
     loss = find_loss(config.loss, modules)
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
-    default_target = config.target.integrator is None
     scene, config, notes = _loaded(config, base, shots, given)
     params = traversed(scene)
     parameters.require_finite(params)
@@ -312,7 +311,7 @@ def build_problem(
     unsolved, unsolved_poses = make_variables(scene, params, entries, base, modules, given.starts, bounded)
     derived = make_derived(params, derivations, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
-    opened = _Opened(scene, params, keys, sensors, integrator, default_target)
+    opened = _Opened(scene, params, keys, sensors, integrator)
     config, targets, truth, messages = _seen(config, targets, used, opened, base, disk)
     notes += messages
     judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
@@ -367,17 +366,13 @@ def _loaded(
 
 @dataclass(frozen=True)
 class _Opened:
-    """The scene of a job, the parameters that the job recovers, and the index of the sensor of each view.
-
-    ``default_target`` says that the job does not choose the integrator of its targets.
-    """
+    """The scene of a job, the parameters that the job recovers, and the index of the sensor of each view."""
 
     scene: mi.Scene
     params: mi.SceneParameters
     keys: list[str]
     sensors: dict[str, int]
     integrator: mi.Integrator
-    default_target: bool
 
 
 def _seen(
@@ -385,8 +380,7 @@ def _seen(
 ) -> tuple[Config, Targets, dict[str, Array], tuple[str, ...]]:
     """Read or render the targets if none are given.
 
-    Returns the job, whose default integrator of targets suits the target scene, targets, true values by key, and notes
-    for the user.
+    Returns the job with the integrator of its targets filled in, the targets, true values by key, and notes.
     """
     truth: dict[str, Array] = {}
     notes: tuple[str, ...] = ()
@@ -395,8 +389,7 @@ def _seen(
         wanted = [entry.key for entry in config.parameters] + [entry.key for entry in config.derived]
         other = target_scene(*config.target_source, config.target.values, wanted, base)
         truth = truth_of(other, opened.params, opened.keys)
-        if opened.default_target:
-            config = with_default_target(config, opened.integrator, other)
+        config = with_default_target(config, opened.integrator, other)
         if targets is None:
             with one_thread(config.deterministic):
                 seeds = {name: config.seeds(TARGET, index)[0] for name, index in opened.sensors.items()}
@@ -415,13 +408,13 @@ def _seen(
 
 
 def _notes_on_black(targets: Targets) -> tuple[str, ...]:
-    black = [name for name, image in targets.images.items() if not np.any(image)]
+    black = [name for name, image in targets.images.items() if not np.any(image[..., : colours_of(image.shape[-1])])]
     if not black:
         return ()
     more = f" (and of {len(black) - 1} more)" if len(black) > 1 else ""
     return (
-        f"the target of view '{black[0]}'{more} is black: the target scene shows no light there; check its emitters, "
-        "sensors and max_depth",
+        f"the target of view '{black[0]}'{more} is black: the target scene shows no light there; check its emitters "
+        "and sensors, and [target] integrator",
     )
 
 
