@@ -124,7 +124,7 @@ def differentiable_radiance(
                 moves = driver(prepared, again(), δL, lost)
                 dr.eval()
         except Unreached:  # other operations of the caller may depend on the parameters
-            return
+            moves = False
         tell(TermResult(lost=lost.count, paths=paths, moves=moves))
 
     return dr.custom(_Radiance, L, forward_pass, reverse_pass, inputs), valid

@@ -34,9 +34,9 @@ def nested_in(integrator: mi.Integrator) -> list[mi.Integrator]:
 
 
 def without_channels(integrator: mi.Integrator) -> mi.Integrator:
-    """Return the integrator inside of integrators that contain a single one; others are returned unchanged."""
+    """Return the innermost integrator, as long as each integrator adds channels to the image of a single other one."""
     inner = nested_in(integrator)
-    return without_channels(inner[0]) if len(inner) == 1 else integrator
+    return without_channels(inner[0]) if len(inner) == 1 and integrator.aov_names() else integrator
 
 
 def read_limits(integrator: mi.Integrator) -> Limits | None:
@@ -47,8 +47,9 @@ def read_limits(integrator: mi.Integrator) -> Limits | None:
     known = isinstance(integrator, mi.Integrator)  # callers may not have checked what a user has given
     if known:
         integrator = without_channels(integrator)
-        if nested_in(integrator):
-            return None
+        inner = nested_in(integrator)
+        if inner:
+            return read_limits(inner[0]) if len(inner) == 1 else None
     # Python integrators have attributes; C++ integrators only print the values.
     printed = dict(re.findall(r"(max_depth|rr_depth) = (-?\d+)", str(integrator)))
     if known and integrator.class_name() == DIRECT:

@@ -20,10 +20,10 @@ _RECORDABLE = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
 """Classes of Mitsuba's integrators that `dr.freeze` can record."""
 _PROJECTIVE = "Projective"
 """Substring in the class names of Mitsuba's integrators that estimate boundary terms."""
-PARTICLES = "pathreplay_particles"
-PTRACER = "ptracer"
+PARTICLES, PTRACER = "pathreplay_particles", "ptracer"
+"""Names of the plugins that trace all light from the emitters."""
 _LIGHT_PATHS = {"ParticleIntegrator": PARTICLES, "ParticleTracerIntegrator": PTRACER}
-"""Plugins that trace all light from the emitters, by class."""
+"""These plugins by class."""
 
 
 @runtime_checkable

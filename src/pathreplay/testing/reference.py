@@ -63,7 +63,7 @@ def integrator_under_test(
     whole = scene.integrator()
     own = None if whole is None else without_channels(whole)
     unchanged = max_depth is None and not boundary and isinstance(own, mi.CppADIntegrator)
-    if spec is None and whole is not None and nested_in(whole):
+    if spec is None and whole is not None and whole.aov_names() and nested_in(whole):
         tested = f": '{integrator_name(own)}' inside of it is" if unchanged else ""
         mi.Log(
             mi.LogLevel.Warn,

@@ -52,7 +52,7 @@ def _samples_alone(bsdf: mi.BSDF, component: int) -> bool:
     with dr.suspend_grad():
         try:
             sample, weight = bsdf.sample(ctx, si, w, mi.Point2f(x, y), mi.Bool(True))
-        except Exception:  # code of the user, which the pass itself calls on shapes only
+        except Exception:  # the user's code may need a shape, which this probe lacks
             return True
         alone = (sample.sampled_component == component) & ((sample.sampled_type & bsdf.flags(component)) != 0)
         return bool(dr.all(alone | dr.all(weight == 0)))
