@@ -622,7 +622,9 @@ def test_check_passes_light_paths() -> None:
     command = ["check", "scene.xml", "--param", "floor.bsdf.reflectance.value", "--seeds", "6", "--spp", "64"]
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
-    assert "particle (backward)" in done.output, done.output
+    assert "pathreplay_particles (backward) against finite differences of pathreplay_particles" in done.output, (
+        done.output
+    )
 
 
 def test_a_repeated_seed_uses_no_control_variate_of_its_own(log: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
