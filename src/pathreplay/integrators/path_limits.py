@@ -82,8 +82,8 @@ def counterpart(integrator: mi.Integrator, scene: mi.Scene) -> Json | None:
 
 def notes_on_visibility(integrator: mi.Integrator, scene: mi.Scene) -> tuple[str, ...]:
     """Return a note if emitters could be seen, but the scene's integrator does not tell whether it hides them."""
-    lights = (light for light in scene.emitters() if not mi.has_flag(light.flags(), mi.EmitterFlags.Delta))
-    if light_path_plugin(without_channels(integrator)) != PTRACER or next(lights, None) is None:
+    extended = any(not mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters())
+    if light_path_plugin(without_channels(integrator)) != PTRACER or not extended:
         return ()
     return (
         "the scene's 'ptracer' does not expose its hide_emitters, so emitters are taken as visible; to hide them, give "
@@ -91,12 +91,17 @@ def notes_on_visibility(integrator: mi.Integrator, scene: mi.Scene) -> tuple[str
     )
 
 
-def without_unbounded(limits: Limits) -> dict[str, int]:
-    """Return limits by name, without a ``max_depth`` of -1, the default of Mitsuba's integrators.
+def copied_limits(integrator: mi.Integrator) -> Json:
+    """Return the limits that our plugins take over from a scene's integrator, by name; empty if they are unknown.
 
-    It is not copied to `pathreplay`. With unbounded paths, `pathreplay` would trace each path twice.
+    A ``max_depth`` of -1 is the default of Mitsuba's integrators, and is copied only from our own. With unbounded
+    paths, `pathreplay` would trace each path twice.
     """
-    return {name: value for name, value in vars(limits).items() if name != "max_depth" or value >= 0}
+    limits = read_limits(integrator)
+    if limits is None:
+        return {}
+    ours = "adjoint" in stateful(without_channels(integrator)).options()
+    return {name: value for name, value in vars(limits).items() if ours or name != "max_depth" or value >= 0}
 
 
 def _whole(number: Any) -> int:

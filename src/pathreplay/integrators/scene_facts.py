@@ -22,7 +22,6 @@ from pathreplay.transport.facts.traits import (
     INSTANCE,
     MASK,
     PLASTIC,
-    SUNSKY,
     Tables,
     Traits,
     blend_lengths,
@@ -156,7 +155,7 @@ class SceneFacts:
             opacity_moves=any(with_gradients(mask, "opacity", "weight") for mask in self._masks if is_veil(mask)),
             tables_move=any(with_gradients(plastic, "alpha", "eta") for plastic in self._plastics),
             splines_move=any(with_gradients(curve, "control_points") for curve in self._splines),
-            skies_move=any(with_gradients(light) for light in self._lights if light.class_name() == SUNSKY),
+            skies_move=self._traits.sunsky is not None and bool(with_gradients(self._traits.sunsky)),
             lights_vary=any(map(with_gradients, self._emitters)),
         )
 

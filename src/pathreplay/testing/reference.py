@@ -13,12 +13,12 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.path_limits import (
+    copied_limits,
     counterpart,
     nested_in,
     notes_on_visibility,
     read_limits,
     without_channels,
-    without_unbounded,
 )
 from pathreplay.integrators.stateful import PARTICLES, light_path_plugin, stateful
 from pathreplay.scenes.descriptions import load_integrator
@@ -86,8 +86,8 @@ def integrator_under_test(
         name = spec or _own_name(own, bool(boundary))
         options = {} if own is None or name not in _OURS else stateful(own).options()
         description = {"type": name}
-        if limits is not None:
-            description |= without_unbounded(limits) if name in _OURS and "adjoint" not in options else vars(limits)
+        if own is not None and limits is not None:
+            description |= copied_limits(own) if name in _OURS else vars(limits)
         if name == PARTICLES:
             options.pop("caustics", None)
         kept = ("boundary", "boundary_spp", "caustics") if spec else tuple(options)

@@ -42,12 +42,10 @@ class SeenLights:
             sample = probes_of(sensor)
             probes = dr.width(sample.position)
             per_probe = min(-(-len(scene.emitters()) // probes), MOST)
-            everywhere, none = dr.full(mi.Bool, True, probes), dr.full(mi.Bool, False, probes)
-            parts = [(sample.position, everywhere, none)]
-            parts.append(_emitters_on_film(scene, sensor, sample, max(per_probe, 1) * probes))
-            positions, insides, brights = zip(*parts, strict=True)
-            position = mi.Point2f(*(dr.concat([part[k] for part in positions]) for k in (0, 1)))
-            inside, bright = dr.concat(list(insides)), dr.concat(list(brights))
+            position, inside, bright = _emitters_on_film(scene, sensor, sample, max(per_probe, 1) * probes)
+            position = mi.Point2f(*(dr.concat([sample.position[k], position[k]]) for k in (0, 1)))
+            inside = dr.concat([dr.full(mi.Bool, True, probes), inside])
+            bright = dr.concat([dr.full(mi.Bool, False, probes), bright])
             ray = mi.Ray3f(sample.at(position).ray(sensor)[0])
             hit = scene.ray_intersect_preliminary(ray, coherent=False, active=inside)
             met = inside & hit.is_valid()
@@ -89,19 +87,9 @@ def _emitters_on_film(
         motion = film_velocity(light.p - ray(t), ray_derivatives(sensor, middle), mi.Float(1))
         position = mi.Point2f(middle.position + motion)
         return position, extended & ~sky & (t > 0) & dr.all((position >= 0) & (position <= 1)), mi.Bool(sky)
-    p = dr.select(sky, _point_of_sky(sensor, origin.p, light.d), light.p)
-    position, inside = _projected(sensor, p)
-    return position, extended & inside, sky & (light.pdf > BRIGHT)
-
-
-def _point_of_sky(sensor: mi.Sensor, origin: mi.Point3f, d: mi.Vector3f) -> mi.Point3f:
-    """Return a point in direction ``d`` that the sensor can project. It leaves out what is beyond its clips."""
-    return origin + dr.sqrt(sensor.near_clip() * sensor.far_clip()) * d
-
-
-def _projected(sensor: mi.Sensor, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
-    """Return the film position at which a sensor would see the point ``p``, and whether it lies on the film."""
-    point = dr.zeros(mi.Interaction3f, dr.width(p))
-    point.p = p
+    distance = dr.sqrt(sensor.near_clip() * sensor.far_clip())  # a projection leaves out what is beyond the clips
+    point = dr.zeros(mi.Interaction3f, n)
+    point.p = dr.select(sky, origin.p + distance * light.d, light.p)
     seen, _ = sensor.sample_direction(point, mi.Point2f(0.5))
-    return mi.Point2f(seen.uv) / mi.ScalarVector2f(sensor.film().crop_size()), seen.pdf > 0
+    position = mi.Point2f(seen.uv) / mi.ScalarVector2f(sensor.film().crop_size())
+    return position, extended & (seen.pdf > 0), sky & (light.pdf > BRIGHT)

@@ -8,11 +8,11 @@ import mitsuba as mi
 
 from pathreplay.integrators.path_limits import (
     Limits,
+    copied_limits,
     counterpart,
     notes_on_visibility,
     read_limits,
     without_channels,
-    without_unbounded,
 )
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
@@ -74,11 +74,8 @@ def _limits(plugin: Plugin) -> Limits | None:
 
 def _options(own: mi.Integrator) -> Json:
     """Return options of `pathreplay` that match the scene's integrator, or none if its path limits are unknown."""
-    limits = read_limits(own)
-    if limits is None:
-        return {}
-    options = stateful(without_channels(own)).options()
-    return (vars(limits) if "adjoint" in options else without_unbounded(limits)) | options
+    limits = copied_limits(own)
+    return limits | stateful(without_channels(own)).options() if limits else {}
 
 
 def _differences(ours: Limits | None, theirs: Limits | None, config: Config) -> tuple[str, ...]:

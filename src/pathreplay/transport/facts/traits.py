@@ -121,6 +121,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     masked = [n for bsdf in bsdfs if bsdf.class_name() == MASK for n in nodes_of(bsdf) if isinstance(n, mi.BSDF)]
     blends = [bsdf for bsdf in bsdfs if bsdf.class_name() == BLEND]
     narrow = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
+    sunsky = next((light for light in scene.emitters() if light.class_name() == SUNSKY), None)
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
         lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs if not _is_made_of(bsdf, EXACT)), default=0),
@@ -130,7 +131,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         projectors=tuple(light for light in scene.emitters() if light.class_name() == PROJECTOR),
         spots=tuple(light for light in scene.emitters() if light.class_name() == SPOT),
-        sunsky=next((light for light in scene.emitters() if light.class_name() == SUNSKY), None),
+        sunsky=sunsky,
         directed_areas=any(light.class_name() == DIRECTED_AREA for light in scene.emitters()),
         broken_lights=any(_bounding_sphere(shape)[3] > 0 for shape in shapes if shape.is_emitter()),
         sphere_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
@@ -144,7 +145,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         blended_mirrors=any(map(is_specular, blends)),
         narrow=narrow,
         glossy=narrow and not any(node.class_name() == CHECKERBOARD for node in nodes),
-        outlines=not _seamless(shapes, nodes) or any(light.class_name() == SUNSKY for light in scene.emitters()),
+        outlines=not _seamless(shapes, nodes) or sunsky is not None,
     )
 
 
