@@ -24,7 +24,7 @@ from pathreplay.platform import progress_bar
 from pathreplay.scenes.parameters import get_array
 from pathreplay.testing import check_gradient, command
 from pathreplay.testing.direction import choose_line
-from pathreplay.testing.objective import integrator_name, smooth_weights
+from pathreplay.testing.objective import Objective, integrator_name, smooth_weights
 from pathreplay.testing.reference import integrator_under_test, read_limits, reference_integrator
 from pathreplay.testing.statistics import gap, normal
 from pathreplay.testing.stencil import BACKWARD, CENTRAL, FORWARD, UPWARD, WIDE, Stencil
@@ -687,6 +687,25 @@ def test_each_check_is_told_when_it_is_there(
     assert keys[0] in seen[1].out and keys[1] not in seen[1].out
     assert f"pathreplay: {keys[0]} (1/2): 11 of 11 renderings\n" in seen[1].err
     assert seen[2].err.startswith(f"pathreplay: checking {keys[1]} (2/2)\n") and keys[1] in seen[2].out
+
+
+def test_the_first_gradient_is_announced_in_a_pipe(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Its kernels may take minutes to compile. Later lines are those of a pause, and a quick check has none."""
+    (tmp_path / "ball.xml").write_text(SCENE.format(bsdf="diffuse"))
+    plain, seen = Objective.derivative, []
+
+    def watched(*arguments: Any) -> float:
+        seen.append(capsys.readouterr().err)
+        return plain(*arguments)
+
+    monkeypatch.setattr(Objective, "derivative", watched)
+    monkeypatch.setattr(progress_bar, "PAUSE_S", float("inf"))
+    key = "sky.radiance.value"
+    run(monkeypatch, str(tmp_path / "ball.xml"), "--param", key, "--seeds", "2", "--spp", "1")
+    lines = f"pathreplay: checking {key} (1/1)", f"pathreplay: {key} (1/1): compiling and measuring the first gradient"
+    assert seen == ["\n".join([*lines, ""]), ""] and not capsys.readouterr().err
 
 
 def test_command_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -17,8 +17,12 @@ Told = Callable[[int, int], None]
 
 
 @contextmanager
-def progress_bar(what: str, line: Callable[[int, int], str]) -> Iterator[Told]:
-    """Yield the function that updates the bar, whose name is ``what``. Without a terminal, it may print a ``line``."""
+def progress_bar(what: str, line: Callable[[int, int], str], announced: Collection[int] = (0,)) -> Iterator[Told]:
+    """Yield the function that updates the bar, whose name is ``what``.
+
+    Without a terminal, the function prints a ``line`` if the last line is `PAUSE_S` old. At the numbers of completed
+    steps in ``announced``, it always prints a line.
+    """
     console = Console(stderr=True, force_jupyter=False)
     if console.is_terminal:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -30,7 +34,7 @@ def progress_bar(what: str, line: Callable[[int, int], str]) -> Iterator[Told]:
 
     def tell(done: int, total: int) -> None:
         nonlocal last
-        if done == 0 or time.monotonic() - last >= PAUSE_S:
+        if done in announced or time.monotonic() - last >= PAUSE_S:
             last = time.monotonic()
             console.print(Text(f"pathreplay: {line(done, total)}"), soft_wrap=True)
 

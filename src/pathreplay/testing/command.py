@@ -46,15 +46,20 @@ def check_all(
     tested = integrator_under_test(integrator, scene, max_depth, boundary)
     keys = resolve_differentiable(traversed(scene), patterns, tested)
     for i, key in enumerate(keys):
-        with _progress(f"{key} ({i + 1}/{len(keys)})") as progress:
+        with _progress(f"{key} ({i + 1}/{len(keys)})", "compiling and measuring the first gradient") as progress:
             result = check_gradient(scene, key, integrator=tested, progress=progress, **options)
         yield result
 
 
-def _progress(what: str) -> AbstractContextManager[Told]:
-    return progress_bar(
-        what, lambda done, total: f"{what}: {done} of {total} renderings" if done else f"checking {what}"
-    )
+def _progress(what: str, second: str = "") -> AbstractContextManager[Told]:
+    """Show the progress of ``what``. Without a terminal, a line announces its ``second`` step, if that may be long."""
+
+    def line(done: int, total: int) -> str:
+        if done == 0:
+            return f"checking {what}"
+        return f"{what}: {second}" if second and done == 1 else f"{what}: {done} of {total} renderings"
+
+    return progress_bar(what, line, (0, 1) if second else (0,))
 
 
 def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:

@@ -114,7 +114,8 @@ def check_gradient(  # noqa: PLR0913 (most are keyword-only)
             check concerns the renderer. None selects the mean of the image under smooth weights between 0.5 and 1.5.
             These weights differ between channels and places, so that errors of opposite sign do not cancel.
         seed: determines all random numbers and the direction.
-        progress: called with (finished renderings, total renderings), first with 0 after all arguments are validated.
+        progress: called with (finished renderings, total renderings), first with 0 after all arguments are validated,
+            and with 1 before the first gradient.
 
     Returns:
         the estimates, their standard errors and the verdict (see :mod:`pathreplay.testing.verdict`).
