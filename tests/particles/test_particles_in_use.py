@@ -14,12 +14,13 @@ import pytest
 from typer.testing import CliRunner
 
 import pathreplay
+from driven import attached
 from particle_scenes import HEIGHT, WIDTH, balls, dome, images, meter, misty, panel, room, sensor, slab
 from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.cli import app
 from pathreplay.inverse.config.schema import make_config
 from pathreplay.inverse.loop.loop import new_run, take_step
-from pathreplay.inverse.problem.problem import build_problem, put_values
+from pathreplay.inverse.problem.problem import build_problem, notes_on_edges, put_values
 from pathreplay.jobs import optimize
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
@@ -371,6 +372,26 @@ def test_edges_that_light_paths_leave_out_are_told(plugin: dict, more: dict, lef
     assert all(f"'light.position' moves, and the gradient of light paths leaves out {left_out}: " in t for t in told)
 
 
+@pytest.mark.parametrize("plugin", [{**CAUSTICS, "boundary": "none"}, {**CAUSTICS, "boundary": "primary"}])
+def test_edges_that_all_paths_leave_out_are_told_in_one_line(plugin: dict, log: list[str]) -> None:
+    """With `primary`, light paths and camera paths leave out different edges."""
+    gradient(loaded(balls("glass", light="point")), plugin, "light.position", 4)
+    told = [line for line in log if "'light.position' moves" in line]
+    assert len(told) == (1 if plugin["boundary"] == "none" else 2), log
+    assert sum("the gradient leaves out moving edges" in line for line in told) == (plugin["boundary"] == "none")
+
+
+@BOTH
+def test_edges_that_a_problem_tells_of_are_not_told_again(plugin: dict, log: list[str]) -> None:
+    scene, integrator = loaded(balls("glass", light="point")), mi.load_dict(plugin)
+    params = mi.traverse(scene)
+    (note,) = notes_on_edges(params, ["light.position"], integrator)
+    assert "'light.position' moves, and the gradient leaves out moving edges" in note
+    with attached(scene, "light.position"):
+        integrator.render_backward(scene, params, mi.TensorXf(weights(scene)), 0, 2, 4)
+    assert not [line for line in log if "moving edges" in line], log
+
+
 @pytest.mark.usefixtures("without_edge_terms")
 @BOTH
 def test_edges_that_light_paths_in_media_leave_out_are_told(plugin: dict, log: list[str]) -> None:
@@ -385,6 +406,23 @@ def test_edges_in_the_light_of_a_projector_are_told(log: list[str]) -> None:
     scene = loaded(balls("glass", light="projector"))
     gradient(scene, {**PARTICLES, "boundary": "all", "max_depth": 2}, "light.to_world", 4)
     assert any("leaves out edges in the light of emitter 'light': " in line for line in log), log
+
+
+@pytest.mark.parametrize(
+    ("plugin", "material", "count"), [(PARTICLES, "mirror", 1), (PARTICLES, "diffuse", 0), (CAUSTICS, "mirror", 0)]
+)
+def test_light_of_mirrors_that_no_light_path_brings_to_a_meter_is_told_once(
+    plugin: dict, material: str, count: int, log: list[str]
+) -> None:
+    """In an image and in a gradient; camera paths from the meter find this light."""
+    scene, integrator = loaded(balls(material, sensor=meter())), mi.load_dict(plugin)
+    for seed in (1, 2):
+        integrator.render(scene, seed=seed, spp=4)
+    with attached(scene, FLOOR) as params:
+        integrator.render_backward(scene, params, mi.TensorXf(weights(scene)), 0, 3, 4)
+    told = [line for line in log if "receives directly from a mirror or smooth glass" in line]
+    assert len(told) == count, log
+    assert all("irradiance meter 'meter'" in line and "use 'pathreplay'" in line for line in told), log
 
 
 @pytest.mark.parametrize(("darkest", "count"), [(0.0, 1), (0.01, 0)])

@@ -12,6 +12,7 @@ from pathreplay.integrators.edge_notes import edges_note, keys_that_move_edges
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.platform import compat
 from pathreplay.transport.facts.traits import is_specular
+from pathreplay.transport.sensor import METER
 from pathreplay.transport.vertex import TraceConfig
 
 COST_OF_EDGES = (
@@ -166,10 +167,24 @@ def particle_doubts(trace: TraceConfig) -> Iterator[str]:
         )
 
 
-def particle_notes(trace: TraceConfig, sensor: mi.Sensor, omitted: Iterable[str] | None) -> Iterator[str]:
+def meter_note(trace: TraceConfig, sensor: mi.Sensor) -> str:
+    """Format the message about light from mirrors and smooth glass that light paths do not bring to a meter.
+
+    Returns "" for other sensors, and for scenes without mirrors and smooth glass.
+    """
+    if sensor.class_name() != METER or not any(map(is_specular, trace.traits.mirrors)):
+        return ""
+    return (
+        f"light that irradiance meter '{sensor.id()}' receives directly from a mirror or smooth glass is missing from "
+        "the image and its gradient: use 'pathreplay', or, if the emitters have no extent, a camera that sees the "
+        "receiver; see docs/particles.md"
+    )
+
+
+def particle_notes(trace: TraceConfig, sensor: mi.Sensor, omitted: Iterable[str]) -> Iterator[str]:
     """Yield messages about the derivatives that the gradient of light paths leaves out.
 
-    ``omitted`` lists the edges that the boundary term leaves out. None means that there is no boundary term.
+    ``omitted`` lists the edges that are left out.
     """
     if sensor.film().rfilter().is_box_filter():
         yield (
@@ -177,7 +192,7 @@ def particle_notes(trace: TraceConfig, sensor: mi.Sensor, omitted: Iterable[str]
             "across pixels is missing from the gradient; use a 'tent' or 'gaussian' filter"
         )
     moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
-    left_out = "moving edges" if omitted is None else " and ".join(omitted)
+    left_out = " and ".join(omitted)
     if moving and left_out:
         yield (
             f"'{moving[0]}' moves, and the gradient of light paths leaves out {left_out}: measure the error with "

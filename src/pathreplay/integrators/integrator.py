@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import reduce
 from operator import add
@@ -402,9 +402,7 @@ class PathReplayIntegrator(PathIntegrator):
         if result.moves and (note := sun_note(trace)):
             self._warn_once(note)
         if self.particles is not None and result.moves:
-            edges = self.boundary in ("auto", "all")
-            omitted = ParticleBoundary(self.particles).notes(trace) if edges else None
-            for note in particle_notes(trace, view.sensor, omitted):
+            for note in particle_notes(trace, view.sensor, self._omitted_by(self.particles, trace)):
                 self._warn_once(note)
             if not self.particles.caustics:
                 return
@@ -415,6 +413,17 @@ class PathReplayIntegrator(PathIntegrator):
             self.warned.add(EDGES)
         if note:
             self._warn_once(note)
+
+    def _omitted_by(self, particles: ParticleTerm, trace: TraceConfig) -> Iterable[str]:
+        """Return the edges that the gradient of light paths leaves out, except for edges that another note names.
+
+        With ``boundary = 'none'``, the note of `missing_edges` names edges of camera paths and light paths, and so does
+        the note of a `Problem`.
+        """
+        if self.boundary in ("auto", "all"):
+            return ParticleBoundary(particles).notes(trace)
+        named = self.boundary == "none" and (particles.caustics or EDGES in self.warned)
+        return () if named else ("moving edges",)
 
     def _log_sample_notes(self, trace: TraceConfig) -> None:
         for doubt in (*doubts(trace), *sample_doubts(trace, self.particles is not None)):

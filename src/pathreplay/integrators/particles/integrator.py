@@ -7,6 +7,7 @@ from dataclasses import replace
 import mitsuba as mi
 
 from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.diagnostics import meter_note
 from pathreplay.integrators.integrator import PathReplayIntegrator
 from pathreplay.integrators.particles.term import ParticleTerm
 from pathreplay.integrators.pass_state import PassState
@@ -67,7 +68,9 @@ class ParticleIntegrator(PathReplayIntegrator):
         return replace(view, spp=min(view.spp, max(MOST_RAYS // (width * height), LEAST_A_PIXEL)))
 
     def _trace_config(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
-        """Return the configuration of the camera rays, which see emitters directly."""
+        """Return the configuration of the camera rays, which see emitters directly. Warn of light that is missing."""
         trace = PathIntegrator._trace_config(self, scene, sensor, state)
         self.particles.require_no_emission(trace)
+        if sensor is not None and (note := meter_note(trace, sensor)):
+            self._warn_once(note)
         return replace(trace, max_depth=min(trace.max_depth, 1))
