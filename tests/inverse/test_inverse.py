@@ -165,7 +165,12 @@ BAD_CONFIGS = {
         "did you mean 'fit'?",
     ),
     "missing key": ({"parameters": [{"lower": 0}]}, "key 'parameters.0.key' is missing"),
-    "no parameters": ({"parameters": []}, "'parameters'"),
+    "no parameters": ({"parameters": []}, "'parameters' is []; give at least 1 entry"),
+    "too many axes": (
+        {"parameters": [{"key": "a", "shape": [1] * 9}]},
+        "'parameters.0.shape' is [1, 1, 1, 1, 1, 1, 1, 1, 1]; give at most 8 entries",
+    ),
+    "an option of the optimizer": ({"tolerance": 0.1}, "unknown key 'tolerance'; it is a key of 'optimizer'"),
     "upper below lower": (
         {"parameters": [{"key": "a", "lower": 1, "upper": 0.5}]},
         "'a': upper bound 0.5 is not above lower bound 1",

@@ -27,7 +27,7 @@ from pathreplay.jobs import make_config, optimize
 from pathreplay.scenes.loading import load_scene
 from pathreplay.transport.facts.nodes import with_gradients
 from places import ROOT
-from variant import VARIANT
+from variant import MONO, VARIANT
 
 RED = "red.reflectance.value"
 README = ROOT / "README.md"
@@ -724,6 +724,20 @@ def loaded_before() -> dict[str, Any]:
         (bad(parameters={WALL: Parameter(bounds=(1, 0))}), "is not above lower bound"),
         (bad(parameters={WALL: Parameter(bounds=1)}), r"'wall.*': bounds are 1; give \(lower, upper\)"),
         (bad(parameters={WALL: Parameter(bounds=(0, 1, 2))}), r"bounds are \(0, 1, 2\)"),
+        (bad(parameters={WALL: Parameter(bounds=([0, 0, 0], 1))}),
+         r"^Parameter 'wall.*': bounds are \(\[0, 0, 0\], 1\); give \(lower, upper\)"),
+        (bad(parameters={WALL: Parameter(bounds=(0, np.nan))}), r"^Parameter 'wall.*': bounds are \(0, nan\)"),
+        (bad(parameters={WALL: Parameter(bounds=(0, 10**400))}), r"^Parameter 'wall.*': bounds are \(0, 1000"),
+        (bad(parameters={WALL: Parameter(initial=10**400)}), r"^problem: Parameter 'wall.*': 'initial': 1000"),
+        (bad(parameters={WALL: Parameter(bounds=(0, 1e50))}), r"^Parameter 'wall.*': bounds are \(0, 1e\+50\)"),
+        (bad(parameters={WALL: Parameter(initial=np.nan)}), "Parameter 'wall.*': 'initial' is nan; give finite n"),
+        (bad(parameters={WALL: Parameter(initial=[1, 2, np.inf])}), r"'wall.*': 'initial' is \[1, 2, inf\]; give f"),
+        (bad(parameters={WALL: Parameter(learning_rate=-1)}), "Parameter 'wall.*': 'learning_rate' is -1: input"),
+        (bad(parameters={BODY: Parameter(pose="rigid", pivot=[0, 1])}),
+         r"Parameter 'body.*': 'pivot' is \[0, 1\]; give at least 3 entries"),
+        (bad(parameters={}), "^parameters: there are none; give {KEY: Parameter"),
+        (bad(parameters=[]), "^parameters: there are none; give {KEY: Parameter"),
+        (bad(tolerance=1e-3), "unknown key 'tolerance'; it is a key of 'optimizer'"),
         (bad(parameters={WALL: Parameter(initial=Path("no.exr"))}), "is the image 'no.exr', but"),
         (bad(parameters={WALL: Parameter(initial=np.zeros(5))}), "of shape \\(5,\\)"),
         (bad(parameters={WALL: Parameter(parameterization="cube")}), "parameterization"),
@@ -786,6 +800,15 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
     assert textured.render({TEXTURE: np.zeros((8, 8, 3))}, spp=1).shape == (SIDE, SIDE, 3)
     with pytest.raises(PathreplayError, match="minimize: 'steps' is 0"):
         pathreplay.minimize(problem, steps=0, progress=False)
+    for optimizer, key, told in (
+        ("levenberg-marquardt", "tolerance", r'optimizer=\{"type": "levenberg-marquardt", "tolerance": 0.5\}'),
+        (None, "beta_1", r'optimizer=\{"type": "adam", "beta_1": 0.5\}'),
+        ({"type": "sgd"}, "momentum", r'optimizer=\{"type": "sgd", "momentum": 0.5\}'),
+        ("adam", "momentum", r'optimizer=\{"type": "sgd", "momentum": 0.5\}'),
+        (mi.ad.Adam(lr=0.1), "beta_1", "give it to the optimizer object"),
+    ):
+        with pytest.raises(PathreplayError, match=f"minimize: '{key}' is an option of the optimizer; .*{told}"):
+            pathreplay.minimize(problem, optimizer, progress=False, **{key: 0.5})
     stages = [{"iterations": 5}]
     with pytest.raises(PathreplayError, match="steps is 50, but the stages have 5 in total; remove 'steps'"):
         pathreplay.minimize(problem, steps=50, stages=stages, progress=False)
@@ -805,6 +828,113 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
         pathreplay.minimize(problem, response={"kind": "gamma"}, progress=False)
     with pytest.raises(PathreplayError, match=r"'stages.0' is 'iterations': .*; write a table"):
         pathreplay.minimize(problem, stages={"iterations": 2}, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"optimizer": {"type": "levenberg-marquardt"}}, "needs a sum of squares, which the function in 'loss' is not"),
+        ({"pixel_batch_size": 4}, "the function in 'loss' needs whole images"),
+        ({"response": {"kind": "gamma"}}, "the function in 'loss' is not quadratic"),
+    ],
+)
+def test_a_loss_of_ones_own_has_no_other_name(settings: dict[str, Any], words: str, photos: list[np.ndarray]) -> None:
+    def own(image: Any, target: Any) -> Any:
+        return dr.abs(image - target)
+
+    problem = Problem(room(), {WALL: GREY}, views(photos), loss=own)
+    assert repr(problem).endswith("loss own>")
+    with pytest.raises(PathreplayError, match=words) as told:
+        Problem(room(), {WALL: GREY}, views(photos), loss=own, **settings)
+    assert "memory" not in str(told.value)
+    if "optimizer" in settings:
+        pair = [Problem(room(), {WALL: GREY}, views(photos), loss=loss) for loss in ("l2", own)]
+        with pytest.raises(PathreplayError, match="in all scenes, which the function in 'loss' is not"):
+            pathreplay.minimize(Problem.joint(pair), "levenberg-marquardt", progress=False)
+
+
+def test_a_problem_of_another_variant_is_told(photos: list[np.ndarray]) -> None:
+    """It can be used again in its variant."""
+    problem = Problem(room(), {WALL: GREY}, views(photos), spp=1)
+    f, state = pathreplay.value_and_grad(problem), pathreplay.init(problem)
+    kept: list[pathreplay.Iteration] = []
+    result = pathreplay.minimize(problem, steps=1, progress=False, callbacks=kept.append)
+    before = f(seed=3)[0]
+    uses: list[Callable[[], object]] = [
+        lambda: f(),
+        lambda: pathreplay.value_and_grad(problem),
+        lambda: problem.render(spp=1),
+        lambda: pathreplay.minimize(problem, steps=1, progress=False),
+        lambda: pathreplay.init(problem),
+        lambda: pathreplay.step(problem, state),
+        lambda: kept[0].render(spp=1),
+        lambda: result.render(spp=1),
+        lambda: Problem.joint([problem, problem]),
+    ]
+    mi.set_variant(MONO)
+    for use in uses:
+        with pytest.raises(PathreplayError, match=f"'{VARIANT}', but the active variant is '{MONO}'; call") as told:
+            use()
+        assert "\n" not in str(told.value)
+    mi.set_variant(VARIANT)
+    assert f(seed=3)[0] == pytest.approx(before, rel=1e-5)
+
+    def leave(_: pathreplay.Iteration) -> None:
+        mi.set_variant(MONO)
+
+    with pytest.raises(PathreplayError, match=f"'{VARIANT}', but the active variant is '{MONO}'"):
+        pathreplay.minimize(problem, steps=3, progress=False, callbacks=leave)
+
+
+def test_values_that_are_not_finite_are_told(photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY}, views(photos), spp=1)
+    f = pathreplay.value_and_grad(problem)
+    for value in ([0.5, np.nan, 0.5], np.inf, 1e50):
+        for use in (f, problem.render):
+            with pytest.raises(PathreplayError, match=f"^Value of '{WALL}' holds . NaN or infinite values"):
+                use({WALL: value})
+
+
+def test_gradients_of_a_loss_that_is_not_finite_are_nan(photos: list[np.ndarray]) -> None:
+    """Zeros would look like a minimum."""
+    problem = Problem(room(), {WALL: GREY, TEXTURE: GREY}, views(photos), spp=1)
+    f = pathreplay.value_and_grad(problem)
+    for _ in range(2):  # the second call records
+        loss, gradients = f({WALL: 1e30})
+        assert not np.isfinite(loss)
+        assert all(np.isnan(gradients[key]).all() for key in (WALL, TEXTURE))
+        assert {key: g.shape for key, g in gradients.items()} == {WALL: (3,), TEXTURE: (4, 4, 3)}
+    loss, gradients = f()
+    assert np.isfinite(loss) and all(np.isfinite(g).all() for g in gradients.values())
+
+
+def test_a_number_is_the_value_of_all_entries(photos: list[np.ndarray]) -> None:
+    """As in `Parameter`. A pose has no such value."""
+    wanted = {WALL: GREY, TEXTURE: GREY, BODY: Parameter(pose="translation")}
+    problem = Problem(room(), wanted, views(photos), spp=1, integrator=NO_EDGES, deterministic=True)
+    f = pathreplay.value_and_grad(problem)
+    found, expected = (
+        f({WALL: 0.25, TEXTURE: np.float32(0.75)}),
+        f({WALL: [0.25] * 3, TEXTURE: np.full((4, 4, 3), 0.75)}),
+    )
+    assert found[0] == expected[0]
+    for key, gradient in expected[1].items():
+        np.testing.assert_array_equal(found[1][key], gradient)
+    with pytest.raises(PathreplayError, match=r"translation' has the shape \(\), not the shape \(3,\)"):
+        f({f"{BODY}:translation": 0.5})
+
+
+def test_targets_of_grey_and_with_alpha(photos: list[np.ndarray]) -> None:
+    """Grey stands for three equal channels. The colours of arrays with alpha are those of renderings: multiplied."""
+    grey, alpha = photos[0][:, :, 1], np.full((SIDE, SIDE, 1), 0.5, np.float32)
+    for target, expected in (
+        (grey, np.dstack([grey] * 3)),
+        (grey[:, :, None], np.dstack([grey] * 3)),
+        (np.dstack([photos[0], alpha]), photos[0]),
+        (mi.Bitmap(np.dstack([photos[0], alpha])), photos[0]),
+    ):
+        found = Problem(room(), {WALL: GREY}, View(0, target)).built.views[0].target
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

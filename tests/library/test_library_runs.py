@@ -174,6 +174,22 @@ def test_what_cannot_go_on_is_told_in_one_line(photos: list[np.ndarray]) -> None
     assert run(problem, output="run", resume=True, steps=5).history[-1].iteration == 4
 
 
+def test_an_empty_folder_is_resumed_as_a_new_run(photos: list[np.ndarray]) -> None:
+    """And again, when it is a run. Without ``resume``, it is left alone."""
+    Path("run").mkdir()
+    problem = problem_of(photos)
+    assert run(problem, output="run", steps=4).folder == Path("run-2").absolute()
+    assert run(problem, output="run", steps=4, resume=True).folder == RUN.absolute()
+    assert len(run(problem, output="run", steps=5, resume=True).history) == 5
+    Path("link").symlink_to("empty")
+    Path("empty").mkdir()
+    with pytest.raises(PathreplayError, match=r"Run folder link is empty, but cannot be replaced .*; give another 'ou"):
+        run(problem, output="link", steps=4, resume=True)
+    (Path("empty") / "file").touch()
+    with pytest.raises(PathreplayError, match="empty is not a run folder"):
+        run(problem, output="empty", steps=4, resume=True)
+
+
 def test_an_impossible_output_is_noticed_before_images_are_rendered(
     photos: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:

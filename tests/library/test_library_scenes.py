@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 import pathreplay
-from library_scenes import GREY, SIDE, TEXTURE, WALL, photos_of_room, room, views
+from library_scenes import BODY, GREY, SIDE, TEXTURE, WALL, photos_of_room, room, views
 from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.scenes.loading import load_scene
 from small_job import checkpoint_bits
@@ -125,6 +126,78 @@ def test_media_of_several_scenes_learn_each_for_itself() -> None:
         state = pathreplay.step(problem, state)
     names = {name.partition(":")[0] for name in state._learned}
     assert names == {"0", "1"} and len({state._learned[f"{n}:sums"].sum() for n in (0, 1)}) == 2
+
+
+def test_what_a_shared_parameter_has_in_one_scene_only_is_told() -> None:
+    """Parameters of one name would otherwise have the options of the first problem."""
+    photos = photos_of_room()
+
+    def lighter(values: Any) -> Any:
+        return dr.mean(values, axis=None)
+
+    def problem_of(key: str = WALL, **entry: Any) -> Problem:
+        given = Parameter(**{"initial": 0.5, "bounds": (0, 1), **entry})
+        return Problem(room(), {key: given}, View("left", photos[0]))
+
+    first = problem_of()
+    for other, words in (
+        (problem_of(initial=0.25), r"'initial' is 0.5 in problem 0 and 0.25 in problem 1 \(at index \(0,\)\)"),
+        (problem_of(initial=[0.5, 0.5, 0.75]), r"'initial' is 0.5 in problem 0 and 0.75 in problem 1 .*index \(2,\)\)"),
+        (problem_of(bounds=(0, 0.75)), r"'bounds' is \(0.0, 1.0\) in problem 0 and \(0.0, 0.75\) in problem 1"),
+        (
+            problem_of("wall.*value", bounds=(None, 1)),
+            r"'bounds' is \(0.0, 1.0\) in problem 0 and \(None, 1.0\) in problem 1",
+        ),
+        (problem_of(parameterization="logit"), "'parameterization' is None in problem 0 and 'logit' in problem 1"),
+        (problem_of(learning_rate=0.5), "'learning_rate' is 0.02 in problem 0 and 0.5 in problem 1"),
+        (problem_of(regularizer=lighter), "'regularizer' is None in problem 0 and 'lighter' in problem 1"),
+    ):
+        with pytest.raises(PathreplayError, match=f"^problems: parameter '{WALL}': {words}; .*same") as told:
+            Problem.joint([first, other])
+        assert "\n" not in str(told.value)
+    pair = [problem_of(regularizer=lighter), problem_of("wall.*value", regularizer=lighter)]
+    assert set(Problem.joint(pair).initial) == {WALL}
+    with pytest.raises(PathreplayError, match="'regularizer' is 'lighter' in problem 0 and 'lambda' in problem 1"):
+        Problem.joint([pair[0], problem_of(regularizer=lambda values: 2 * lighter(values))])
+    made = [problem_of(regularizer=lambda values: lighter(values)) for _ in range(2)]
+    with pytest.raises(PathreplayError, match="is one function 'lambda' in problem 0 and another in problem 1; create"):
+        Problem.joint(made)
+    moved = [
+        Problem(room(), {BODY: Parameter(pose="translation", initial={"translation": [x, 0, 0]})}, views(photos))
+        for x in (0.0, 0.5)
+    ]
+    with pytest.raises(
+        PathreplayError, match=r"'body.*:translation': 'initial' is 0 in problem 0 and 0.5 in problem 1"
+    ):
+        Problem.joint(moved)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "words"),
+    [
+        ({"spp": 16}, {"spp": 64}, "'spp' is 16 in problem 0 and 64 in problem 1"),
+        ({}, {"eval_spp": 4}, "'eval_spp' is 128 in problem 0 and 4 in problem 1"),
+        ({"seed": 1}, {"seed": 2}, "'seed' is 1 in problem 0 and 2 in problem 1"),
+        ({}, {"deterministic": True}, "'deterministic' is False in problem 0 and True in problem 1"),
+        ({"optimizer": {"type": "sgd"}}, {}, "'optimizer' is {'type': 'sgd'} in problem 0 and .*adam.* in problem 1"),
+        ({}, {"iterations": 300}, "'iterations' is 200 in problem 0 and 300 in problem 1"),
+    ],
+)
+def test_settings_that_cannot_both_hold_are_told(first: Any, second: Any, words: str) -> None:
+    photos = photos_of_room()
+    pair = [Problem(room(), {WALL: GREY}, View("left", photos[0]), **settings) for settings in (first, second)]
+    with pytest.raises(PathreplayError, match=f"^problems: {words}; .*same") as told:
+        Problem.joint(pair)
+    assert "\n" not in str(told.value)
+
+
+def test_settings_of_each_scene_may_differ() -> None:
+    """Its loss, integrator, and the learning rate of what only this scene has."""
+    photos = photos_of_room()
+    one = Problem(room(), {WALL: GREY}, View("left", photos[0]), loss="l1", integrator={"type": "prb"})
+    two = Problem(room(), {TEXTURE: GREY}, View("right", photos[1], test=False), learning_rate=0.5)
+    joint = Problem.joint([one, two])
+    assert {v.key: v.learning_rate for v in joint.built.variables} == {WALL: 0.02, TEXTURE: 0.5}
 
 
 def test_what_scenes_cannot_share_is_told() -> None:

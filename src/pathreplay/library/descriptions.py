@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from numbers import Real
 from pathlib import Path
 
 import drjit as dr
@@ -11,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
+from pathreplay.inverse.config.parameter_options import MEMORY
+from pathreplay.inverse.config.tables import LARGEST
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.scenes.parameters import get_array
 from pathreplay.types import Json
@@ -27,7 +30,8 @@ class Parameter:
         initial: initial value: a number, a colour, an array in the parameter's shape, or an image or volume file. For a
             pose, a displacement ``{"translation": [x, y, z], "rotation": [rx, ry, rz]}`` (scene units, degrees).
             Default: the value in the scene.
-        bounds: lower and upper bound, enforced by projection after each step.
+        bounds: lower and upper bound, two numbers for all entries, enforced by projection after each step. None is no
+            bound.
         learning_rate: learning rate; with Adam, approximately the length of a step. Default: the learning rate of the
             problem.
         parameterization: ``"log"``, ``"softplus"`` or ``"logit"``: steps are taken in this function of the value.
@@ -92,7 +96,10 @@ class View:
         target: linear pixels (height, width, channels): a NumPy or Dr.Jit array, a `mi.Bitmap`, or an image file.
             Bitmaps and files are decoded from sRGB if they have 8 or 16 bits, and composited over black. Arrays of
             8- or 16-bit integers are refused, because their encoding is unknown. Mitsuba takes the colours of a bitmap
-            that was made from an array for premultiplied by alpha; see ``mi.Bitmap.set_premultiplied_alpha``.
+            that was made from an array for premultiplied by alpha; see ``mi.Bitmap.set_premultiplied_alpha``. If the
+            film has three channels, a grey target (also of shape (height, width)) is compared with each of them. If
+            the film has no alpha, the alpha of a target is dropped. The colours of arrays count as premultiplied by
+            alpha, as in renderings.
         weight: nonnegative pixel weights (height, width), normalised to mean 1: an array, a `mi.Bitmap` or an image
             file. The stored values of bitmaps and files are used, without decoding; colours are converted to luminance.
             Default: equal weights.
@@ -141,17 +148,18 @@ class Objects:
         if isinstance(function, str):
             return function
         plain = getattr(function, "__name__", type(function).__name__).strip("<>")
-        name, count = f"memory:{plain}", 1
+        name, count = f"{MEMORY}{plain}", 1
         while name in self.functions and self.functions[name] is not function:
             count += 1
-            name = f"memory:{plain}-{count}"
+            name = f"{MEMORY}{plain}-{count}"
         self.functions[name] = function
         return name
 
     def tables(self, wanted: Mapping[str, Parameter | None]) -> list[Json]:
         """Convert parameters to tables.
 
-        Raises PathreplayError if the initial value of a pose is an array, or bounds are no pair.
+        Raises PathreplayError if the initial value of a pose is an array, an initial value is not finite, or bounds are
+        not two numbers.
         """
         return [self._table(key, entry or Parameter()) for key, entry in wanted.items()]
 
@@ -161,6 +169,7 @@ class Objects:
         table |= {each.name: getattr(entry, each.name) for each in fields(Parameter) if each.name != "bounds"}
         if entry.regularizer is not None:
             table["regularizer"] = self.named(entry.regularizer)
+        _require_finite(key, entry.initial)
         given = _array(key, entry.initial)
         if given is not None and given.ndim == 0:
             table["initial"] = given.item()
@@ -189,10 +198,29 @@ class Objects:
 
 
 def _pair(key: str, bounds: object) -> tuple[object, object]:
-    """Return the lower and the upper bound. Raises PathreplayError unless there are two bounds."""
+    """Return the lower and the upper bound. Raises PathreplayError unless they are two numbers, or None."""
     if isinstance(bounds, Iterable) and len(pair := list(bounds)) == 2:
-        return pair[0], pair[1]
-    raise PathreplayError(f"Parameter '{key}': bounds are {shown(bounds)}; give (lower, upper), where None is no bound")
+        if all(each is None or _is_single(each) for each in pair):
+            return pair[0], pair[1]
+    raise PathreplayError(
+        f"Parameter '{key}': bounds are {shown(bounds)}; give (lower, upper), two finite numbers for all entries, "
+        "where None is no bound"
+    )
+
+
+def _is_single(value: object) -> bool:
+    """Return whether a value is a number within the range of single precision."""
+    try:
+        return isinstance(value, Real) and abs(float(value)) <= LARGEST
+    except OverflowError:  # the integer exceeds the range of double precision
+        return False
+
+
+def _require_finite(key: str, value: object) -> None:
+    """Raise PathreplayError if an initial value is a number, or a list of numbers, that is not finite."""
+    entries = value if isinstance(value, (list, tuple)) else [value]
+    if not all(np.isfinite(each) for each in entries if isinstance(each, (float, np.floating))):
+        raise PathreplayError(f"Parameter '{key}': 'initial' is {shown(value)}; give finite numbers")
 
 
 def _array(key: str, value: object) -> Array | None:

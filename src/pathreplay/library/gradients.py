@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from pathreplay.errors import require_count
@@ -27,13 +28,19 @@ def value_and_grad(problem: Problem) -> ValueAndGrad:
 
     Returns:
         ``f(values=None, seed=0, spp=None)``, which returns the loss and the gradients by name. ``values`` are arrays by
-        name; missing values are initial values. ``seed`` selects the sampled paths, and ``spp`` is the number of
-        samples per pixel.
+        name, or numbers for all entries; missing values are initial values. ``seed`` selects the sampled paths, and
+        ``spp`` is the number of samples per pixel.
 
         The loss is the mean over the training views plus regularizers. Noise in the images increases the loss; for
         ``l2``, the increase is the variance of the images. The gradients have the shapes of the values and are unbiased
-        for ``l2``, ``relative-l2`` and ``display-l2``. Gradient entries that are NaN or infinite count as zero.
+        for ``l2``, ``relative-l2`` and ``display-l2``. Gradient entries that are NaN or infinite count as zero. If the
+        loss is NaN or infinite, all gradients are NaN.
+
+    Raises:
+        PathreplayError: another variant is active than when the problem was created. The function also raises it if a
+            value is not finite, or has the wrong name or shape.
     """
+    problem.require_variant()
     built = replace(problem.built, config=problem.built.config.model_copy(update={"stages": None}))
     config = built.config
     evaluator = evaluator_of(built, built.integrator, config.integrator)
@@ -59,6 +66,8 @@ def value_and_grad(problem: Problem) -> ValueAndGrad:
             if variable.penalty is not None:
                 value, slope = variable.penalty.of(at[variable.key])
                 loss, gradients[variable.key] = loss + value, gradients[variable.key] + slope
+        if not np.isfinite(loss):  # finite gradients would look like those of a valid loss, and zeros like a minimum
+            gradients = {key: np.full_like(gradient, np.nan) for key, gradient in gradients.items()}
         return loss, gradients
 
     return evaluated

@@ -22,7 +22,7 @@ from pathreplay.inverse.problem import problem as inner
 from pathreplay.inverse.problem.problem import put_values
 from pathreplay.library.folder_run import FolderRun, with_saved_targets
 from pathreplay.library.iterations import Iteration, iterations, run_of
-from pathreplay.library.optimizers import Stepper, adapted, options_of
+from pathreplay.library.optimizers import Stepper, adapted, options_of, require_no_options
 from pathreplay.library.problem import Problem, run_settings
 from pathreplay.platform import memory
 from pathreplay.platform.interrupts import Stop, stopping
@@ -31,7 +31,15 @@ from pathreplay.report.live_pictures import LivePictures
 from pathreplay.report.notebook import NotebookPanel, progress_of
 from pathreplay.report.progress import Progress
 from pathreplay.report.recovered import with_scene
-from pathreplay.runs.run_folder import Job, new_output, open_run_folder, record_job, require_creatable
+from pathreplay.runs.run_folder import (
+    Job,
+    is_empty_folder,
+    new_output,
+    open_run_folder,
+    record_job,
+    remove_empty_folder,
+    require_creatable,
+)
 from pathreplay.types import Json
 
 
@@ -106,8 +114,8 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         progress: show a bar on a terminal, the loss curve and images in a notebook, or lines elsewhere.
         output: run folder for checkpoints, the page of ``pathreplay watch`` and the report. If the folder exists, a
             number is appended. Default: no files are written.
-        resume: resume the run in ``output`` from its last checkpoint, if the folder exists. The folder then records
-            the settings of this call.
+        resume: resume the run in ``output`` from its last checkpoint, if the folder exists and is not empty. The folder
+            then records the settings of this call.
         stages: tables of settings for parts of the run, like ``[[stages]]`` in a job; their ``iterations`` replace
             ``steps``.
         learning_rate_schedule: ``"constant"`` (the default), ``"exponential"``, ``"linear"`` or ``"cosine"``.
@@ -125,6 +133,7 @@ def minimize(  # noqa: PLR0913 (most arguments are keyword-only)
         PathreplayError: settings are invalid, loss or values are not finite, or the folder is in use, damaged, or
             belongs to another problem.
     """
+    require_no_options("minimize", settings, optimizer, problem.built.config.optimizer)
     options, own = options_of(optimizer, problem.built.config.optimizer)
     settings |= {
         "stages": None if stages is None else [dict(each) if isinstance(each, Mapping) else each for each in stages],
@@ -175,7 +184,7 @@ def _minimized(
         in_python, opened, resumed = problem.in_memory or own is not None, None, None
         if resume and output is None:
             raise PathreplayError("resume = True needs a folder; give 'output'")
-        if resume and output is not None and output.exists():
+        if resume and output is not None and output.exists() and not is_empty_folder(output):
             opened, resumed = open_run_folder(output, in_python)
             stack.callback(resumed.lock.close)
             built = with_saved_targets(resumed.path, built)
@@ -187,6 +196,8 @@ def _minimized(
         kept = None
         if output is not None:
             run.optimiser.state()  # raises PathreplayError if the state of the user's optimizer cannot be saved
+            if resume and resumed is None:
+                remove_empty_folder(output)
             job = Job(built.config, None, problem.base, in_python=in_python)
             changed = opened is not None and _settings(opened.config) != _settings(built.config)
             if opened is not None and not changed:

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.optimizer_options import Optimizer
+from pathreplay.errors import PathreplayError, shown
+from pathreplay.inverse.config.optimizer_options import DEFAULTS, Optimizer
 from pathreplay.inverse.loop.loop import optimiser_of
 from pathreplay.inverse.optim.adaptive import Optimiser, State
 from pathreplay.inverse.parameters.exposures import EXPOSURE
@@ -219,3 +219,27 @@ def options_of(optimizer: object, known: Optimizer) -> tuple[Json | None, object
         "mitsuba.ad, an object with step(values, gradients, learning_rates, loss), or a function like "
         "scipy.optimize.minimize"
     )
+
+
+def require_no_options(name: str, settings: Mapping[str, object], optimizer: object, known: Optimizer) -> None:
+    """Check that no setting of a run is an option of its optimizer.
+
+    Args:
+        name: start of the message.
+        settings: settings of the run by key of a job.
+        optimizer: argument ``optimizer`` of `minimize`.
+        known: the optimizer of the job.
+
+    Raises:
+        PathreplayError: a setting belongs into the mapping that describes the optimizer.
+    """
+    found = next((key for key in settings if any(key in options for options in DEFAULTS.values())), None)
+    if found is None:
+        return
+    options, own = options_of(optimizer, known)
+    if own is not None:
+        raise PathreplayError(f"{name}: '{found}' is an option of the optimizer; give it to the optimizer object")
+    kinds = [kind for kind, of_kind in DEFAULTS.items() if found in of_kind]
+    kind = known.type if options is None else options["type"]
+    mapping = f'{{"type": "{kind if kind in kinds else kinds[0]}", "{found}": {shown(settings[found])}}}'
+    raise PathreplayError(f"{name}: '{found}' is an option of the optimizer; write optimizer={mapping}")

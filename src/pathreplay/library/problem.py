@@ -17,12 +17,15 @@ from pathreplay.inverse.dataset.targets import Targets
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.losses.pixelwise import LOSSES
 from pathreplay.inverse.objective.reached import require_possible
-from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.pose import PART_NAMES
+from pathreplay.inverse.parameters.values import Array, Arrays, require_finite_array
 from pathreplay.inverse.parameters.variables import Variable, free_of, keys_of
 from pathreplay.inverse.problem import joint as inner_joint
 from pathreplay.inverse.problem import problem as inner
+from pathreplay.inverse.problem.feasibility import require_variant
 from pathreplay.library.descriptions import Derived, Objects, Parameter, View, by_key, require_kinds
 from pathreplay.library.iterations import rendered
+from pathreplay.library.sharing import Part, require_alike
 from pathreplay.library.views import by_name, targets_of
 from pathreplay.platform import backend
 from pathreplay.platform.device import require_order
@@ -111,11 +114,14 @@ class Problem:
     ) -> None:
         """Replace parts of the job's tables by the given objects, and build the problem."""
         self.base, self.job, objects = base, job, Objects()
+        self.functions = objects.functions
         self.notes: tuple[str, ...] = ()
         if mi.variant() is None or "variant" in job:
             backend.set_variant(job.get("variant"))
         job["variant"] = mi.variant()  # for runs that are resumed or exported by the command line
         wanted = None if parameters is None else by_key(parameters)
+        if wanted == {}:
+            raise PathreplayError("parameters: there are none; give {KEY: Parameter(...)}, or a list of keys")
         integrator = {"type": integrator} if isinstance(integrator, str) else integrator
         looked_at = None if views is None else [views] if isinstance(views, View) else list(views)
         require_kinds(wanted or {}, looked_at or (), derived or {})
@@ -142,7 +148,8 @@ class Problem:
         self.in_memory = memory != inner.InMemory()
         """Whether the problem contains objects that a job file cannot describe."""
         known = {"iterations", "stages"} & set(job)
-        config = make_config(job if known else {"iterations": MOST_ITERATIONS, **job}, "problem")
+        names = {f"parameters.{n}": f"Parameter '{key}'" for n, key in enumerate(wanted or {})}
+        config = make_config(job if known else {"iterations": MOST_ITERATIONS, **job}, "problem", names)
         self.built = inner.build_problem(config, base, targets, memory if self.in_memory else None)
         require_possible(self.built)
 
@@ -151,24 +158,29 @@ class Problem:
         """Combine problems with different scenes into one, whose loss is the mean of their losses.
 
         Args:
-            problems: the problems. Parameters with the same name are shared; their initial value, bounds, learning rate
-                and regularizers come from the first problem that has the parameter. Settings such as ``spp``, ``seed``
-                and ``deterministic`` come from the first problem.
+            problems: the problems. Parameters with the same name are shared, and must have the same initial value,
+                bounds, learning rate and other options in all problems that have the parameter. Settings such as
+                ``spp``, ``seed`` and ``deterministic`` must be the same in all problems. Each problem keeps its
+                integrator and its loss.
 
         Returns:
             The combined problem, which uses the problems' scenes. Its views have names such as ``0-left`` and
             ``1-left``.
 
         Raises:
-            PathreplayError: shared parameters have different shapes, two problems have the same scene, or a problem has
-                exposures, a response or a baseline.
+            PathreplayError: shared parameters have different shapes, options or initial values, settings differ, two
+                problems have the same scene, or a problem has exposures, a response or a baseline.
         """
         if isinstance(problems, Problem) or not problems:
             found = "this is a single one" if problems else "there are none"
             raise PathreplayError(f"problems: {found}; give a list of problems")
+        for n, problem in enumerate(problems):
+            problem.require_variant()
+            if isinstance(problem.built, inner_joint.JointProblem):
+                raise PathreplayError(f"problems: problem {n} is itself joint; list the problems that it combines")
         joint: Problem = Problem.__new__(Problem)
         first = problems[0]
-        joint.base, joint.in_memory = first.base, True
+        joint.base, joint.in_memory, joint.functions = first.base, True, {}
         joint.notes = tuple(dict.fromkeys(note for problem in problems for note in problem.notes))
         tables = {kind: [each for p in problems for each in p.job.get(kind, [])] for kind in ("parameters", "derived")}
         known = {kind: list({table["key"]: table for table in all_[::-1]}.values()) for kind, all_ in tables.items()}
@@ -181,10 +193,13 @@ class Problem:
         joint.job.pop("capture", None)  # its cameras and images are among the views
         config = first.built.config.model_copy(update={"parameters": make_config(joint.job).parameters})
         joint.built = inner_joint.joined([problem.built for problem in problems], config)
+        require_alike([Part(problem.built, problem.job, problem.functions) for problem in problems])
         return joint
 
     def __repr__(self) -> str:
-        return f"<Problem: {', '.join(self.initial)}; {len(self.built.views)} views, loss {self.built.config.loss}>"
+        return (
+            f"<Problem: {', '.join(self.initial)}; {len(self.built.views)} views, loss {self.built.config.loss_name}>"
+        )
 
     @property
     def scene(self) -> mi.Scene:
@@ -202,7 +217,7 @@ class Problem:
         """Render a view.
 
         Args:
-            values: arrays by name; default: initial values.
+            values: arrays by name, or numbers for all entries; default: initial values.
             view: index or name of the view.
             spp: samples per pixel; default: ``eval_spp``.
 
@@ -210,12 +225,16 @@ class Problem:
             Linear pixels (height, width, channels).
 
         Raises:
-            PathreplayError: a value has the wrong name or shape, or the view does not exist.
+            PathreplayError: a value is not finite, or has the wrong name or shape, the view does not exist, or another
+                variant is active than when the problem was created.
         """
         return rendered(self.built, self.complete(values), view, spp)
 
     def complete(self, values: Mapping[str, ArrayLike] | None) -> dict[str, Array]:
-        """Add initial values for missing ones. Raises PathreplayError if a value has the wrong name or shape."""
+        """Add initial values for missing ones.
+
+        Raises PathreplayError if a value is not finite, or has the wrong name or shape.
+        """
         given, starts = values or {}, {v.key: v.start for v in self.built.variables}
         if unknown := set(given) - set(starts):
             raise PathreplayError(f"No parameter '{min(unknown)}' in the problem; it has {', '.join(starts)}")
@@ -223,6 +242,10 @@ class Problem:
             key: _fitted(key, given[key], start.shape) if key in given else np.array(start, np.float32)
             for key, start in starts.items()
         }
+
+    def require_variant(self) -> None:
+        """Raise PathreplayError if another variant is active than when the problem was created."""
+        require_variant(self.built.config.variant)
 
     def configured(self, changes: Mapping[str, object], name: str) -> inner.Problem:
         """Return the problem with changed settings.
@@ -235,8 +258,10 @@ class Problem:
             A problem with the same scene and targets, and with the job's settings overridden by the changes.
 
         Raises:
-            PathreplayError: a setting is invalid, or can be set only when the problem is created.
+            PathreplayError: a setting is invalid, or can be set only when the problem is created, or another variant
+                is active than when the problem was created.
         """
+        self.require_variant()
         if fixed := sorted(OF_A_PROBLEM & set(changes)):
             raise PathreplayError(f"{name}: '{fixed[0]}' belongs to the problem; give it to Problem")
         job = {key: value for key, value in self.job.items() if key != "iterations" or "stages" not in changes}
@@ -321,16 +346,20 @@ def _require_none_of_views(settings: Mapping[str, object]) -> None:
 def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
     """Convert a value to the ``wanted`` shape of its parameter. Textures and grids may have another resolution.
 
-    The entries of a flat parameter, such as vertices, may be rows of an array, or points of Dr.Jit. Raises
-    PathreplayError if the shape does not fit.
+    The entries of a flat parameter, such as vertices, may be rows of an array, or points of Dr.Jit. A number is the
+    value of all entries, except for poses. Raises PathreplayError if the shape does not fit, or a value is not finite.
     """
     if dr.is_array_v(value):
         points = not dr.is_tensor_v(value) and dr.depth_v(value) > 1 and len(wanted) == 1
         value = get_array(dr.ravel(value) if points else value)
     try:
-        array = np.array(value, np.float32)
+        with np.errstate(over="ignore"):  # values beyond single precision become infinite, and are refused below
+            array = np.array(value, np.float32)
     except (TypeError, ValueError):
         raise PathreplayError(f"Value of '{key}' is {shown(value)}; give an array of numbers") from None
+    require_finite_array(f"Value of '{key}'", array)
+    if array.ndim == 0 and not key.endswith(PART_NAMES):
+        return np.full(wanted, array)
     resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
     rows = len(wanted) == 1 and array.size == wanted[0]
     of_vertices = key.rpartition(".")[2].startswith("vertex_")

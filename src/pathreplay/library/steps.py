@@ -17,7 +17,7 @@ from pathreplay.inverse.optim import adaptive
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.parameters.variables import latents
 from pathreplay.inverse.problem import problem as inner
-from pathreplay.library.optimizers import OfMitsuba, Stepper, adapted, options_of
+from pathreplay.library.optimizers import OfMitsuba, Stepper, adapted, options_of, require_no_options
 from pathreplay.library.problem import Problem, run_settings
 
 
@@ -110,6 +110,7 @@ def init(
     Raises:
         PathreplayError: the settings are invalid, or ``executor`` is not ``local``.
     """
+    require_no_options("init", settings, optimizer, problem.built.config.optimizer)
     options, own = options_of(optimizer, problem.built.config.optimizer)
     task = _Task(run_settings("init", steps, options, settings))
     built, executor = task.of(problem, "init")
@@ -134,8 +135,10 @@ def step(problem: Problem, state: State) -> State:
         The state after the step, or ``state`` itself if the optimizer has terminated.
 
     Raises:
-        PathreplayError: loss or values are not finite, or the problem and the state have different parameters.
+        PathreplayError: loss or values are not finite, the problem and the state have different parameters, or another
+            variant is active than when the problem was created.
     """
+    problem.require_variant()
     if state.finished:
         return state
     task = state._task

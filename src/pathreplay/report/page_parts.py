@@ -57,7 +57,7 @@ def facts(config: Config, history: Sequence[Entry]) -> tuple[tuple[str, str], ..
     if history:
         seconds = sum(entry.seconds for entry in history)
         figures += [
-            (f"{history[0].loss:.3g} → {history[-1].loss:.3g}", f"loss ({config.loss})"),
+            (f"{history[0].loss:.3g} → {history[-1].loss:.3g}", f"loss ({config.loss_name})"),
             (f"{seconds:.0f} s", f"{seconds / len(history):.2f} s per iteration"),
         ]
     spp = sorted({entry.spp for entry in history if entry.spp})

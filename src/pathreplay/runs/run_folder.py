@@ -399,6 +399,30 @@ def require_creatable(output: Path, home: Path, source: Path | None) -> None:
         raise PathreplayError(_not_made(output, error, source)) from error
 
 
+def is_empty_folder(path: Path) -> bool:
+    """Return whether a path is a folder that contains nothing. A folder that cannot be read does not count as empty."""
+    try:
+        return path.is_dir() and not any(path.iterdir())
+    except OSError:
+        return False
+
+
+def remove_empty_folder(path: Path) -> None:
+    """Remove a folder if it is empty, so that a new run can have its name.
+
+    Raises PathreplayError if the folder is empty, but cannot be removed, for example because it is a link.
+    """
+    if not is_empty_folder(path):
+        return
+    try:
+        path.rmdir()
+    except OSError as error:
+        raise PathreplayError(
+            f"Run folder {path} is empty, but cannot be replaced by that of a new run ({error.strerror}); give another "
+            f"{_option(None)}"
+        ) from error
+
+
 def _make_part(output: Path, home: Path, source: Path | None) -> Path:
     """Create a hidden folder beside ``output``. `_claim` renames the hidden folder when its content is complete."""
     wanted = home / output

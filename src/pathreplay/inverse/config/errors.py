@@ -23,6 +23,8 @@ _INSTEAD = {
     "finite_number": "write a finite number",
     "json_invalid": "fix the syntax there",
 }
+# Limits of the lengths of lists by pydantic's error type: words for messages, and the name of the limit in the error.
+_LIMITS = {"too_short": ("at least", "min_length"), "too_long": ("at most", "max_length")}
 # Descriptions of the accepted types, for keys that accept several types.
 _KINDS = {
     "initial": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
@@ -75,7 +77,7 @@ _SYNONYMS = {
     "max_depth": "integrator.max_depth",
     "resolution": "scene_parameters.resolution",
 }
-_WITH_OWN_KEYS = ("target", "parameters", "capture")
+_WITH_OWN_KEYS = ("target", "parameters", "capture", "optimizer")
 """Tables whose keys are recognised at the top of a job."""
 
 
@@ -88,35 +90,50 @@ def first_error(
         error: pydantic's error for a whole job.
         job: model of the job.
         tables: models of the tables that a job may contain, by key.
-        names: other names of keys of the job.
+        names: other names of keys and of tables of the job.
     """
     details = error.errors()
     # A value of a union type yields one error per alternative. An unknown key is the most informative of these errors.
     first = next((e for e in details if e["type"] == "extra_forbidden"), details[0])
-    where = ".".join(_path(first["loc"])) or "the job"
-    where = names.get(where, where)
+    owner, where = _named(".".join(_path(first["loc"])) or "the job", names)
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])  # which may be one of `_ALTERNATIVES`
-        where = ".".join([*_path(first["loc"][:-1]), key])
+        owner, where = _named(".".join([*_path(first["loc"][:-1]), key]), names)
         table = next((tables[str(part)] for part in reversed(first["loc"][:-1]) if part in tables), job)
         new = next((name for name in RENAMED.get(key, "").split() if name in table.model_fields), None)
         if new is not None:
-            return f"unknown key '{where}'; it is called '{new}' now"
-        return f"unknown key '{where}'; {_hint(key, table, job, tables)}"
+            return f"{owner}unknown key '{where}'; it is called '{new}' now"
+        return f"{owner}unknown key '{where}'; {_hint(key, table, job, tables)}"
     if first["type"] == "missing":
-        return f"key '{where}' is missing; add it"
+        return f"{owner}key '{where}' is missing; add it"
     if first["type"] == "value_error":
         reason = str(first["ctx"]["error"])
         # Messages about tables already name the table. Messages about numbers lack the key, which is added here.
-        return f"'{where}': {reason}" if isinstance(first["input"], Real) else reason
+        return f"{owner}'{where}': {reason}" if isinstance(first["input"], Real) else reason
     if first["type"] == "import_path":
-        return f"'{where}': {first['msg']}"
+        return f"{owner}'{where}': {first['msg']}"
+    if first["type"] in _LIMITS:
+        limit, name = _LIMITS[first["type"]]
+        count = first["ctx"][name]
+        entries = "entry" if count == 1 else "entries"
+        return f"{owner}'{where}' is {shown(first['input'])}; give {limit} {count} {entries}"
     # If several alternatives failed, describe all types that the key accepts.
     kinds = next((kinds for key, kinds in _KINDS.items() if key in _path(first["loc"])), None)
     if kinds is not None and len(details) > 1:
-        return f"'{where}' is {shown(first['input'])}; write {kinds}"
+        return f"{owner}'{where}' is {shown(first['input'])}; write {kinds}"
     instead = _INSTEAD.get(first["type"])
-    return f"'{where}' is {shown(first['input'])}: {first['msg'].lower()}" + (f"; {instead}" if instead else "")
+    return f"{owner}'{where}' is {shown(first['input'])}: {first['msg'].lower()}" + (f"; {instead}" if instead else "")
+
+
+def _named(where: str, names: Mapping[str, str]) -> tuple[str, str]:
+    """Return the name of the table that contains a key, with a colon, and the name of the key in this table.
+
+    The name of the table is empty if ``names`` does not contain the table.
+    """
+    for table, name in names.items():
+        if where.startswith(f"{table}."):
+            return f"{name}: ", where[len(table) + 1 :]
+    return "", names.get(where, where)
 
 
 def _hint(key: str, table: type[BaseModel], job: type[BaseModel], tables: Mapping[str, type[BaseModel]]) -> str:

@@ -39,6 +39,8 @@ def _import_path(value: str) -> str:
 
 ImportPath = Annotated[str, AfterValidator(_import_path)]
 """Name of a function, written as ``module:function``."""
+MEMORY = "memory:"
+"""Prefix of the names of functions in memory, which take the place of import paths."""
 
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 

@@ -20,6 +20,7 @@ from pathreplay.inverse.config.memory_options import Memory, bytes_of
 from pathreplay.inverse.config.noise_options import AUTO, AdaptiveSpp, Spp
 from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.config.parameter_options import (
+    MEMORY,
     Derivation,
     Displace,
     Displacement,
@@ -171,6 +172,15 @@ class Config(Table):
         return entry.model_copy(update={"refine_at": refine_at, "learning_rate": rate})
 
     @property
+    def loss_name(self) -> str:
+        """The name of the loss to show to the user."""
+        return self.loss.removeprefix(MEMORY)
+
+    @property
+    def _named_loss(self) -> str:
+        return "the function in 'loss'" if self.loss.startswith(MEMORY) else f"loss = '{self.loss}'"
+
+    @property
     def target_source(self) -> tuple[str, dict[str, Argument]]:
         """The scene of rendered targets, and its arguments; default: the scene and the arguments of the job."""
         target = self.target
@@ -282,7 +292,7 @@ class Config(Table):
             return self
         if self.loss not in PIXELWISE:
             raise ValueError(
-                f"response: loss = '{self.loss}' is not quadratic in the image; use {' or '.join(PIXELWISE)}, or "
+                f"response: {self._named_loss} is not quadratic in the image; use {' or '.join(PIXELWISE)}, or "
                 "remove 'response'"
             )
         if self.optimizer.is_second_order:
@@ -319,8 +329,8 @@ class Config(Table):
             return self
         if self.loss not in PIXELWISE:
             raise ValueError(
-                f"pixel_batch_size: loss = '{self.loss}' needs whole images; use {' or '.join(PIXELWISE)}, or "
-                "remove 'pixel_batch_size'"
+                f"pixel_batch_size: {self._named_loss} needs whole images; use {' or '.join(PIXELWISE)}, or remove "
+                "'pixel_batch_size'"
             )
         if self.exposure is not None:
             raise ValueError("pixel_batch_size: 'exposure' needs whole images; remove one of them")
@@ -360,7 +370,7 @@ class Config(Table):
         kind = f"optimizer: type = '{self.optimizer.type}'"
         if self.loss not in PIXELWISE:
             raise ValueError(
-                f"{kind} needs a sum of squares, which loss = '{self.loss}' is not; use {' or '.join(PIXELWISE)}, or "
+                f"{kind} needs a sum of squares, which {self._named_loss} is not; use {' or '.join(PIXELWISE)}, or "
                 "type = 'adam'"
             )
         if isinstance(self.spp, int) and self.spp % (2 * self.parts):
@@ -457,7 +467,8 @@ def _table(path: Path, content: bytes, changes: Sequence[str]) -> object:
 def make_config(values: object, name: str = "config", names: Mapping[str, str] | None = None) -> Config:
     """Make a job from a dictionary, with the checks and messages of `load_config`, which also refuse other objects.
 
-    Messages call the job ``name``. ``names`` are the names in messages of keys that the caller calls differently.
+    Messages call the job ``name``. ``names`` are the names in messages of keys that the caller calls differently, such
+    as 'steps' for 'iterations', and of tables, such as "Parameter 'a'" for 'parameters.0'.
     """
     try:
         return Config.model_validate(values, context=names)

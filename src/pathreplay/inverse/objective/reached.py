@@ -39,11 +39,12 @@ def require_loss(problem: Problem) -> None:
 
     The settings themselves were checked with the loss of the first scene.
     """
-    config, name = problem.config, next((name for name, each in LOSSES.items() if each is problem.loss), "a function")
+    config, name = problem.config, next((name for name, each in LOSSES.items() if each is problem.loss), None)
+    named = f"loss = '{name}'" if name else "the function in 'loss'"
     if config.optimizer.is_second_order and problem.loss not in QUADRATIC:
         raise PathreplayError(
-            f"optimizer: type = '{config.optimizer.type}' needs a sum of squares in all scenes, which loss = '{name}' "
-            f"is not; use {' or '.join(PIXELWISE)}, or type = 'adam'"
+            f"optimizer: type = '{config.optimizer.type}' needs a sum of squares in all scenes, which "
+            f"{named} is not; use {' or '.join(PIXELWISE)}, or type = 'adam'"
         )
     if config.debias and name in CORNERED:
         raise PathreplayError(

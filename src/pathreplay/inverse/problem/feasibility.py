@@ -1,4 +1,4 @@
-"""Preconditions of a job: its parameters can affect an image, and its loss is finite."""
+"""Preconditions of a job: its variant is active, its parameters can affect an image, and its loss is finite."""
 
 from __future__ import annotations
 
@@ -12,6 +12,15 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.losses.pixelwise import Loss, mean_loss
 from pathreplay.platform.owned_arrays import with_space
+
+
+def require_variant(variant: str | None) -> None:
+    """Raise PathreplayError if the variant of a problem is not the active variant. None stands for any variant."""
+    if variant not in (None, mi.variant()):
+        raise PathreplayError(
+            f"The problem was created in variant '{variant}', but the active variant is '{mi.variant()}'; call "
+            f"mi.set_variant('{variant}'), or create the problem again"
+        )
 
 
 def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:

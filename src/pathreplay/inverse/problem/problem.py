@@ -128,9 +128,11 @@ class Problem:
     def computing(self) -> Iterator[None]:
         """Return a context for renderings: it turns errors of integrators into PathreplayError, and limits the memory.
 
-        Deterministic jobs use one thread. Raises PathreplayError if another Python thread is rendering.
+        Deterministic jobs use one thread. Raises PathreplayError if another Python thread is rendering, or if another
+        variant is active than when the problem was created.
         """
         config = self.config
+        feasibility.require_variant(config.variant)
         names = "' or '".join(plugin.type for plugin in (config.integrator, config.baseline) if plugin is not None)
         problem = f"Integrator '{names}' cannot do this job"
         with one_renderer(), one_thread(config.deterministic), errors_as(problem), memory.within(config.budget):

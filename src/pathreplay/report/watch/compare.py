@@ -70,7 +70,7 @@ def page(runs: list[Past]) -> Page:
 def _loss(run: Past) -> str:
     if not run.history:
         return ""
-    return f"{run.history[0].loss:.4g} → {run.history[-1].loss:.4g} ({run.config.loss})"
+    return f"{run.history[0].loss:.4g} → {run.history[-1].loss:.4g} ({run.config.loss_name})"
 
 
 def _learned(run: Past) -> list[str]:
