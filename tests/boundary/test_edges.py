@@ -21,10 +21,10 @@ from pathreplay.boundary.chains import transmittance_of_chain
 from pathreplay.boundary.crofton import BEYOND, BISECTIONS, PlaneSegment, VisibilityProbe, bisect, detect, heading
 from pathreplay.boundary.emitters import BORDER, sample_at
 from pathreplay.boundary.observer import ObserverVertex
-from pathreplay.boundary.primary import FilmCrossing, PrimarySearch
 from pathreplay.boundary.search import Resampled, SegmentDensity
-from pathreplay.boundary.secondary import SecondarySearch
-from pathreplay.boundary.volumetric import VolumetricSearch
+from pathreplay.boundary.searches.primary import FilmCrossing, PrimarySearch
+from pathreplay.boundary.searches.secondary import SecondarySearch
+from pathreplay.boundary.searches.volumetric import VolumetricSearch
 from pathreplay.integrators.boundary_term import INNER_LENGTHS
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
@@ -368,9 +368,9 @@ def test_hard_shadows_on_large_films_lose_no_edges() -> None:
         trace = integrator._trace_config(scene, view.sensor)
         (edges,) = PrimarySearch.of(trace, FilmPlaces.of(view), 0.5).find(2**16, 8, mi.UInt32(1))
         crossing = edges.crossings[0]
-        assert isinstance(crossing, FilmCrossing) and crossing.crease.shadow is not None
-        on_floor = crossing.active & crossing.crease.shadow.exists
-        on_floor &= crossing.near.hit.shape == mi.ShapePtr(next(s for s in scene.shapes() if s.id() == "floor"))
+        assert isinstance(crossing, FilmCrossing) and crossing.edge.crease.shadow is not None
+        on_floor = crossing.edge.active & crossing.edge.crease.shadow.exists
+        on_floor &= crossing.edge.near.hit.shape == mi.ShapePtr(next(s for s in scene.shapes() if s.id() == "floor"))
     weights = np.array(crossing.weight)[0][np.array(on_floor)]
     assert len(weights) > 1000
     assert (weights == 0).mean() < 1e-3  # it was zero for half of them

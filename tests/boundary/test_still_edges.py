@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.boundary.chains import chain_config, probe_chain
+from pathreplay.boundary.chains import begin_chain, chain_config, probe_chain
 from pathreplay.boundary.crofton import STILL
 from pathreplay.integrators.boundary_term import Boundary
 from pathreplay.integrators.camera_pass import Pass
@@ -76,7 +76,12 @@ def test_the_outline_of_static_glass_counts_little(key: str, outline: float, ins
     with dr.suspend_grad():
         places, number = FilmPlaces.of(view), mi.UInt32(7, 7)
         a, b = (
-            probe_chain(chain, places.ray(mi.Point2f(x, 8), number)[0], number, mi.Bool(True), mi.Bool(False))
+            probe_chain(
+                chain,
+                begin_chain(chain, places.ray(mi.Point2f(x, 8), number)[0], mi.Bool(True)),
+                number,
+                mi.Bool(False),
+            )
             for x in (mi.Float(3.0, 7.7), mi.Float(6.0, 8.3))
         )
         np.testing.assert_allclose(a.edge_importance(b), [outline, inside])
@@ -100,7 +105,9 @@ def test_static_hard_shadows_are_no_edges() -> None:
         chain = chain_config(Boundary.informed(view, ours._trace_config(scene, view.sensor)))
         places, key, lanes = FilmPlaces.of(view), mi.UInt32(7, 7), mi.Bool(True, True)
         dark, lit = (
-            probe_chain(chain, places.ray(places.of_point(p)[0], key)[0], key, lanes, mi.Bool(False))
+            probe_chain(
+                chain, begin_chain(chain, places.ray(places.of_point(p)[0], key)[0], lanes), key, mi.Bool(False)
+            )
             for p in (mi.Point3f(-1.5, mi.Float(1.5, -1.5), -2), mi.Point3f(-1.5, mi.Float(0.1, -0.1), -2))
         )
         np.testing.assert_allclose(dark.edge_importance(lit), [0, 1])

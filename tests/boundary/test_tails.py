@@ -19,8 +19,8 @@ import edge_media_scenes as media
 import edge_ordinary
 import edge_scenes as scenes
 from edge_truth import ours
-from pathreplay.boundary import secondary
 from pathreplay.boundary.arcs import Arc
+from pathreplay.boundary.searches import secondary
 from pathreplay.testing.objective import Objective
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from edge_scenes import BY_NAME, INDIRECT, SHADOWS, VEILED
+from edge_scenes import BY_NAME, INDIRECT, REFLECTED, SHADOWS, VEILED
 from edge_truth import backwards, hold_forward, hold_gradients, hold_need, loaded, reference, some
 from pathreplay.boundary import observer
 from pathreplay.boundary.emitters import ShadowCrossing
@@ -21,7 +21,7 @@ from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from pathreplay.transport import velocity
 
-NAMES = pytest.mark.parametrize("name", some([*SHADOWS, *INDIRECT, *VEILED]))
+NAMES = pytest.mark.parametrize("name", some([*SHADOWS, *INDIRECT, *REFLECTED, *VEILED]))
 MANY = 32
 """Passes where a small difference is to be seen, or where small lamps are looked for by chance."""
 COUNTED_TWICE = {
@@ -51,6 +51,13 @@ def test_forward_is_reverse(name: str) -> None:
 @NAMES
 def test_without_edges_they_do_not(name: str) -> None:
     hold_need(name)
+
+
+def test_what_shades_a_pane_of_glass_is_an_edge() -> None:
+    """With few samples: enough to tell that the edges behind the pane are there."""
+    with loaded(replace(BY_NAME["pane_shades"], spp=256, reference_spp=1024)) as bench:
+        differences, g, interior = bench.reference(8), backwards(bench, 8), backwards(bench, 8, boundary="none")
+    assert abs(gap(g, differences).z) < Z_LIMIT < abs(gap(interior, differences).z)
 
 
 @pytest.mark.slow

@@ -325,6 +325,18 @@ def glowing_behind_glass() -> dict:
     return scene(24, ball=shape(T().scale(0.9), GLASS, "sphere"), wall=lamp(far, picture()), object=bright)
 
 
+def behind_a_pane() -> dict:
+    """A wall that a lamp lights through a pane of glass, with a ball between lamp and pane."""
+    pane = OVERHEAD.translate([0, 0, 2.4]).scale([3, 3, 1])
+    return scene(
+        30,
+        wall=shape(BACK, patterned()),
+        pane=shape(pane, {"type": "thindielectric"}),
+        lamp=lamp(OVERHEAD, 20),
+        object=shape(SHADE.translate([0, 0, 0.3]).scale(0.3), BLACK, "sphere"),
+    )
+
+
 def everything() -> dict:
     """Lamps with and without extent, a mirror, glass, a mesh with edges, and a sky: all of them may move."""
     tilted = T().translate([-1.2, 0.2, 0]).rotate([0, 1, 0], 30).scale([0.5, 0.6, 1])
@@ -464,6 +476,16 @@ BENT = [
     cell("emit_sphere", glowing_behind_glass, "ball.to_world", translate(*ASIDE), 6, step=0.01),
 ]  # fmt: skip
 """By mirrors and through glass."""
+REFLECTED = [
+    cell("pane_shades", behind_a_pane, OBJECT, translate(*ASIDE), 4, spp=1024, reference_spp=8192, seeds=24),
+    cell("mirror_shades", by_a_side_wall(plain, lambda: {"type": "conductor"}), OBJECT, translate(1, 0, -1), 3,
+         spp=1024, reference_spp=8192, seeds=48),
+    cell("index_of_a_shade", shadow(lambda: shape(SHADE.scale(0.3), GLASS, "sphere"), plain), "object.bsdf.eta",
+         add(1.0), 4, spp=1024, reference_spp=8192, seeds=32),
+    cell("mirror_in_a_room", by_a_side_wall(plain, lambda: {"type": "conductor"}), "lamp.to_world",
+         translate(1, 0.3, 0.4), 4, spp=1024, reference_spp=8192, seeds=24),
+]  # fmt: skip
+"""Seen by surfaces, in mirrors and through glass."""
 ALL_MOVE = cell("all_move", everything, ("wall.to_world", "lamp.to_world", "bulb.to_world", "mirror.to_world",
     "ball.to_world"), translate(*ASIDE), 3)  # fmt: skip
-BY_NAME = {each.name: each for each in (*SEEN, *TOUCHING, *SHADOWS, *INDIRECT, *VEILED, *BENT)}
+BY_NAME = {each.name: each for each in (*SEEN, *TOUCHING, *SHADOWS, *INDIRECT, *REFLECTED, *VEILED, *BENT)}

@@ -45,6 +45,11 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
     return chain if trace.media is None else replace(chain, media=None, skips_null=True)  # type: ignore[arg-type]
 
 
+def begin_chain(chain: TraceConfig, ray: mi.Ray3f, active: mi.Bool) -> PathState:
+    """Start chains with the rays of a film domain."""
+    return PathState.begin(chain, CameraStart(ray, CounterSampler.of(mi.UInt32(0)), active))
+
+
 def tests_shadows(trace: TraceConfig) -> bool:
     """Return whether the vertices of a chain are tested for hard shadows.
 
@@ -55,19 +60,22 @@ def tests_shadows(trace: TraceConfig) -> bool:
 
 
 @dr.syntax
-def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> VisibilityProbe:
-    """Probe a path from the camera, or from an emitter, to its first vertex without a delta lobe.
+def probe_chain(
+    trace: TraceConfig, path: PathState, key: mi.UInt32, moved: mi.Bool, from_vertex: bool = False
+) -> VisibilityProbe:
+    """Probe a path from its present state to its first vertex without a delta lobe.
 
     Vertices before the first surface that may move are not compared, apart from the first (`VisibilityProbe.still`).
-    In lanes with ``flows`` (see `FilmDomain`), the camera ray may move, so that all surfaces count as moving. Hard
-    shadows that static surfaces cast onto static surfaces are not compared either.
+    In lanes with ``moved``, the first ray may move, so that all surfaces count as moving. Hard shadows that static
+    surfaces cast onto static surfaces are not compared either. Paths ``from_vertex`` start at a vertex that scatters.
+    Their first hits are not compared, because `secondary` does so.
     """
-    sampler = CounterSampler.of(key)
-    path = PathState.begin(trace, CameraStart(ray, sampler, active))
+    sampler = CounterSampler.at_vertex(key, path.depth)
+    moves = mi.Bool(moved)
     if dr.hint(not (trace.traits.mirrors or tests_shadows(trace)), mode="scalar"):
-        moved = flows | may_move(trace, path.at.hit)
-        return dr.select(moved, _probe_vertex(trace, path, key, active & moved), VisibilityProbe.of())
-    probe, moves = VisibilityProbe.of(), mi.Bool(flows)
+        moves |= may_move(trace, path.at.hit)
+        return dr.select(moves, _probe_vertex(trace, path, key, path.active & moves), VisibilityProbe.of())
+    probe, start = VisibilityProbe.of(), mi.UInt32(path.depth)
     shape = shape_met(trace, path.at.hit, path.at.ray, path.active)
     first, still = place_met(trace, path.at.hit, path.active, shape), mi.UInt32(0)
     while dr.hint(path.active, exclude=[trace], label="pathreplay: chain"):
@@ -79,16 +87,18 @@ def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bo
             if dr.hint(trace.to_sensor is None, mode="scalar"):  # the sensor of light paths may move
                 dark &= moves | may_move(trace, test.hit)
             vertex_probe.signature = mixed(vertex_probe.signature, dr.select(dark, mi.UInt32(1), 0))
-        slides = _slides(trace, path.at)
+        slides, at_start = _slides(trace, path.at), path.depth == start
+        if dr.hint(from_vertex, mode="scalar"):
+            vertex_probe = dr.select(at_start, VisibilityProbe.of(), vertex_probe)
         if dr.hint(trace.to_sensor is not None and trace.to_sensor.caustics, mode="scalar"):
             # A path whose first vertex has no delta lobe carries no caustic.
-            vertex_probe = dr.select((path.depth == 0) & ~slides, VisibilityProbe.of(), vertex_probe)
+            vertex_probe = dr.select(at_start & ~slides, VisibilityProbe.of(), vertex_probe)
         path.active &= slides
         u, step = path.choose(trace, sampler)
         step.active &= step.kept.delta
         lobe = dr.select(step.active, step.kept.lobe + 1, 0)
         signature = mixed(mixed(probe.signature, vertex_probe.signature), lobe)
-        still = dr.select((path.depth == 0) & ~moves, mixed(first, lobe) | 1, still)
+        still = dr.select(at_start & (from_vertex | ~moves), mixed(first, lobe) | 1, still)
         probe = replace(vertex_probe, signature=signature, still=still)
         moves |= may_turn(trace, path.at.hit)
         path = path.advance(trace, u, step)[0]
@@ -154,11 +164,11 @@ class ChainSplit:
 
 
 @dr.syntax
-def split_chains(trace: TraceConfig, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: mi.Bool) -> ChainSplit:
+def split_chains(trace: TraceConfig, paths: tuple[PathState, PathState], key: mi.UInt32) -> ChainSplit:
     """Find the first vertex at which two chains with equal random numbers hit different surfaces."""
-    sampler_a, sampler_b = CounterSampler.of(key), CounterSampler.of(key)
-    a = PathState.begin(trace, CameraStart(rays[0], sampler_a, active))
-    b = PathState.begin(trace, CameraStart(rays[1], sampler_b, active))
+    a, b = paths
+    active = a.active & b.active
+    sampler_a, sampler_b = CounterSampler.at_vertex(key, a.depth), CounterSampler.at_vertex(key, b.depth)
     parted = active & _probe_vertex(trace, a, key, active).differs(_probe_vertex(trace, b, key, active))
     go_on = active & ~parted
     while dr.hint(go_on, exclude=[trace], label="pathreplay: split"):

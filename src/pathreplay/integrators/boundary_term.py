@@ -12,9 +12,10 @@ import mitsuba as mi
 from pathreplay.adjoint.autodiff import NonFiniteCounter
 from pathreplay.adjoint.baseline import Baseline
 from pathreplay.boundary.edges import Edges, edges_backward, edges_forward
-from pathreplay.boundary.primary import PrimarySearch
-from pathreplay.boundary.secondary import SecondarySearch
-from pathreplay.boundary.volumetric import ScatteredBeamSearch, VolumetricSearch
+from pathreplay.boundary.searches.primary import PrimarySearch
+from pathreplay.boundary.searches.secondary import SecondarySearch
+from pathreplay.boundary.searches.secondary_chains import SecondaryChainSearch
+from pathreplay.boundary.searches.volumetric import ScatteredBeamSearch, VolumetricSearch
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
@@ -40,6 +41,7 @@ BATCH = "BatchSensor"
 """Class of sensors whose rays cannot be differentiated with respect to film position: Dr.Jit terminates the process."""
 FILM_LENGTH = 0.5  # length of segments on the film, in pixels; shorter for some sensors: see `FilmPlaces.detail`
 INNER_LENGTHS = 0.25, 0.1  # length of segments in the unit square of emitter samples; length of arcs in radians
+CHAIN_LENGTH = 0.05  # length of arcs in radians, if they lead through delta lobes: curved glass shows small images
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,8 @@ class Boundary(Term):
         if self.inner and trace.max_depth > 1:
             search = SecondarySearch.of(trace, places, INNER_LENGTHS)
             yield from search.find(n, NARROW_CLOSER if search.most_arcs > 1 else INNER_CLOSER, seed)
+            if trace.traits.mirrors and trace.media is None and trace.max_depth > 2 and not trace.follows:
+                yield from SecondaryChainSearch.of(trace, places, CHAIN_LENGTH).find(n, INNER_CLOSER, seed)
             if trace.media is not None and trace.traits.hard_lights and trace.max_depth > 2:
                 yield from ScatteredBeamSearch.of(trace, places, INNER_LENGTHS[1]).find(n, INNER_CLOSER, seed)
 

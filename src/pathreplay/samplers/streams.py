@@ -32,6 +32,8 @@ class Stream(IntEnum):
     VOLUMETRIC_CENTRES = 0x1F83D9AB
     SCATTERED_KEYS = 0x5BE0CD19
     SCATTERED_CENTRES = 0x6A09E667
+    CHAIN_KEYS = 0x510E527F
+    CHAIN_CENTRES = 0x3243F6A9
     # The key of the stream is a hash of the value and the seed of the pass.
     PARTICLES = 0x68E31DA4
     # The seed of the stream is a hash of the value plus the index of a part, and the seed of the pass.
@@ -39,6 +41,7 @@ class Stream(IntEnum):
     # The key of the stream is the key of the path ^ the value.
     EMITTER_SEGMENTS = 0x1B873593
     ARCS = 0x38B34AE5  # with several arcs around a vertex: a hash of this key and the number of the arc
+    CHAINS = 0x243F6A88  # chains of delta lobes that start at a vertex
     # The value is the first index of the stream in the sequence of a key.
     ARC = 0x100
     BEYOND_EDGE = 0x20000  # radiance that arrives from behind an edge
@@ -55,6 +58,7 @@ class Stream(IntEnum):
     BISECT_SECONDARY = 1
     BISECT_VOLUMETRIC = 2
     BISECT_SCATTERED = 3
+    BISECT_CHAINS = 4
     # The value is the index of an independent set of Sobol samples of a pixel (`Pass.sobol_sampler`). The interior term
     # uses set 0. The function `pixel_sweep` uses the first `pixel_samples.SETS` sets.
     FLOW = 0x10  # paths for the gradient term `FilmMotion` (`integrators.film.motion`)

@@ -1,4 +1,4 @@
-"""The boundary term of light paths: derivative of an image due to moving edges (see `boundary.emission`)."""
+"""The boundary term of light paths: derivative of an image due to moving edges (see `boundary.searches.emission`)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import mitsuba as mi
 from pathreplay.adjoint.autodiff import NonFiniteCounter
 from pathreplay.adjoint.baseline import Baseline
 from pathreplay.boundary.edges import Edges, edges_backward, edges_forward
-from pathreplay.boundary.emission import EmissionBeamSearch, EmissionSearch
-from pathreplay.boundary.primary import FilmCrossing
-from pathreplay.boundary.volumetric import BeamCrossing
+from pathreplay.boundary.searches.emission import EmissionBeamSearch, EmissionSearch
+from pathreplay.boundary.searches.primary import FilmCrossing
+from pathreplay.boundary.searches.volumetric import BeamCrossing
 from pathreplay.integrators.boundary_term import Boundary, segments_of
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces

@@ -1,4 +1,4 @@
-"""Random numbers of the first rays of light paths, as the domain of an edge search (`boundary.emission`)."""
+"""Random numbers of the first rays of light paths, as the domain of an edge search (`boundary.searches.emission`)."""
 
 from __future__ import annotations
 

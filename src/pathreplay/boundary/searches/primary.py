@@ -36,6 +36,7 @@ from pathreplay.adjoint.autodiff import NonFiniteCounter, derivative_by_place, d
 from pathreplay.adjoint.primal import path_radiance
 from pathreplay.boundary.chains import (
     ChainSplit,
+    begin_chain,
     chain_config,
     probe_chain,
     record_chain,
@@ -84,19 +85,42 @@ class Sides:
 
 
 @dataclass
+class ChainEdge:
+    """The edge between two chains that diverge. The attributes are detached."""
+
+    near: Arrival
+    near_is_a: mi.Bool
+    n: mi.Vector3f  # normal of an outline
+    crease: Crease
+    active: mi.Bool
+
+    @staticmethod
+    def of(chain: TraceConfig, split: ChainSplit, active: mi.Bool) -> ChainEdge:
+        near_is_a, shadow = split.a.hit.t <= split.b.hit.t, None
+        if split.shadows is not None:
+            shadow = HardShadow.between(chain, split.shadows[0], split.shadows[1], active)
+            near_is_a = dr.select(shadow.exists, shadow.in_a, near_is_a)
+        near = dr.select(near_is_a, split.a, split.b)
+        crease = Crease.of(chain, (split.a.hit, split.a.ray), (split.b.hit, split.b.ray), shadow, active)
+        active = active & (near.hit.is_valid() | crease.sky)
+        return ChainEdge(near, near_is_a, edge_normal(near.hit, near.ray, active & ~crease.sky), crease, active)
+
+    def gap(self, at: mi.Ray3f) -> mi.Float:
+        """Evaluate B for the last ray ``at`` of a chain: see `Crossing.gap`."""
+        outline = outline_gap(self.n, at.o, at.d, self.near.hit, at, self.active & ~self.crease.exists)
+        return dr.select(self.crease.exists, self.crease.gap(at, self.active), outline)
+
+
+@dataclass
 class FilmCrossing:
     """Crossing of a film segment with an edge: see `Crossing`."""
 
     weight: mi.Spectrum
-    near: Arrival
-    n: mi.Vector3f
-    crease: Crease
+    edge: ChainEdge
     sides: Sides
-    active: mi.Bool
 
     def gap(self, at: mi.Ray3f) -> mi.Float:
-        outline = outline_gap(self.n, at.o, at.d, self.near.hit, at, self.active & ~self.crease.exists)
-        return dr.select(self.crease.exists, self.crease.gap(at, self.active), outline)
+        return self.edge.gap(at)
 
 
 @dataclass(frozen=True)
@@ -123,27 +147,21 @@ class PrimarySearch(FilmSearch[FilmSegment]):
 
     def probe(self, segment: FilmSegment, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
         s = segment.at(t)
-        return probe_chain(self.chain, self.film.ray(s, segment.key)[0], segment.key, active, self.film.flows(s))
+        path = begin_chain(self.chain, self.film.ray(s, segment.key)[0], active)
+        return probe_chain(self.chain, path, segment.key, self.film.flows(s))
 
     def edge(self, segment: FilmSegment, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
         ends, key = (segment.at(a), segment.at(b)), segment.key
         (ray_a, weight), (ray_b, weight_b) = (self.film.ray(s, key) for s in ends)
         weight = dr.select(dr.any(weight_b != 0), weight, 0)  # an edge of the emission, not of visibility
-        split = split_chains(self.chain, (ray_a, ray_b), key, active)
-        active = active & split.parted
-        near_a, shadow = split.a.hit.t <= split.b.hit.t, None
-        if split.shadows is not None:
-            shadow = HardShadow.between(self.chain, split.shadows[0], split.shadows[1], active)
-            near_a = dr.select(shadow.exists, shadow.in_a, near_a)
-        sides, T = self._sides(split, shadow, ray_a, key, active)
-        jump = weight * split.β * T * self.jump(sides, key)
-
-        near, s = dr.select(near_a, split.a, split.b), dr.select(near_a, *ends)
-        crease = Crease.of(self.chain, (split.a.hit, split.a.ray), (split.b.hit, split.b.ray), shadow, active)
-        active = active & (near.hit.is_valid() | crease.sky)
-        n = edge_normal(near.hit, near.ray, active & ~crease.sky)
-        path, active = record_chain(self.chain, s, self.film.ray(s, key)[0], key, split.k, near.ray, active)
-        return Edges(path, [FilmCrossing(dr.select(active, jump, 0), near, n, crease, sides, active)], None)
+        paths = begin_chain(self.chain, ray_a, active), begin_chain(self.chain, ray_b, active)
+        split = split_chains(self.chain, paths, key)
+        edge = ChainEdge.of(self.chain, split, active & split.parted)
+        sides, T = self._sides(split, edge.crease.shadow, ray_a, key, edge.active)
+        L, s = weight * split.β * T * self.jump(sides, key), dr.select(edge.near_is_a, *ends)
+        ray = self.film.ray(s, key)[0]
+        path, edge.active = record_chain(self.chain, s, ray, key, split.k, edge.near.ray, edge.active)
+        return Edges(path, [FilmCrossing(dr.select(edge.active, L, 0), edge, sides)], None)
 
     def _sides(
         self, split: ChainSplit, shadow: HardShadow | None, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool
@@ -164,21 +182,12 @@ class PrimarySearch(FilmSearch[FilmSegment]):
 
     @property
     def onward(self) -> TraceConfig:
-        """The configuration of the paths behind an edge.
-
-        On coarse meshes, a triangle occludes the part of a lobe that lies below its plane. `steady` makes the shading
-        frames continuous across triangles, so that only this occlusion differs between the two sides of a crease.
-        """
-        traits = self.trace.traits
-        return replace(self.trace, steady_frames=traits.coarse_meshes and not traits.brushed_meshes)
+        """The configuration of the paths behind an edge."""
+        return behind_edges(self.trace)
 
     def jump(self, sides: Sides, key: mi.UInt32) -> mi.Spectrum:
         """Estimate f_a - f_b, with the same random numbers on both sides."""
-        f = [path_radiance(self.onward, CounterSampler.at_vertex(key, sides.k), path)[0] for path in sides.paths()]
-        jump = f[0] - f[1]
-        if sides.shadow is None:
-            return jump
-        return dr.select(sides.shadow.exists, sides.shadow_jump(self.onward, key), jump)
+        return jump_between(self.onward, sides, key)
 
     def slope(self, segment: FilmSegment, edges: Edges) -> mi.Vector2f:
         path, (crossing,) = edges.path, edges.crossings
@@ -190,3 +199,21 @@ class PrimarySearch(FilmSearch[FilmSegment]):
             return dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d)
 
         return derivative_by_place(path.s, along)
+
+
+def behind_edges(trace: TraceConfig) -> TraceConfig:
+    """Return the configuration of the paths behind an edge.
+
+    On coarse meshes, a triangle occludes the part of a lobe that lies below its plane. `steady` makes the shading
+    frames continuous across triangles, so that only this occlusion differs between the two sides of a crease.
+    """
+    traits = trace.traits
+    return replace(trace, steady_frames=traits.coarse_meshes and not traits.brushed_meshes)
+
+
+def jump_between(trace: TraceConfig, sides: Sides, key: mi.UInt32) -> mi.Spectrum:
+    """Estimate f_a - f_b, with the same random numbers on both sides. ``trace`` is that of `behind_edges`."""
+    f = [path_radiance(trace, CounterSampler.at_vertex(key, sides.k), path)[0] for path in sides.paths()]
+    if sides.shadow is None:
+        return f[0] - f[1]
+    return dr.select(sides.shadow.exists, sides.shadow_jump(trace, key), f[0] - f[1])

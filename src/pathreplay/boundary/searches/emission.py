@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
-from pathreplay.boundary.primary import PrimarySearch, Sides
-from pathreplay.boundary.volumetric import VolumetricSearch
+from pathreplay.boundary.searches.primary import PrimarySearch, Sides
+from pathreplay.boundary.searches.volumetric import VolumetricSearch
 from pathreplay.transport.vertex import TraceConfig
 
 

@@ -33,7 +33,7 @@ from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
 from pathreplay.boundary.hard_shadows import HardShadow, ShadowTest
 from pathreplay.boundary.observer import ObserverVertex, SelectedVertex
 from pathreplay.boundary.search import EdgeSearch, FilmSearch, FilmSegment, SegmentDensity
-from pathreplay.boundary.secondary import CameraPath
+from pathreplay.boundary.searches.secondary import CameraPath
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.meet import meet

@@ -1,0 +1,1 @@
+"""The edge searches: each has its own domain of segments (see `search`)."""
