@@ -151,9 +151,9 @@ def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     """Return whether film positions may follow visible surfaces.
 
     Film positions that follow one surface move relative to all other surfaces. The edges of these surfaces must then be
-    sampled, which is impossible behind mirrors, glass and thin sheets, and for B-spline curves. Media are not
-    supported. The caller must exclude textures with seams (see `has_seams`), which cannot be sampled either.
+    sampled, which is impossible behind thin sheets, and for B-spline curves. Media are not supported. The caller must
+    exclude textures with seams (see `has_seams`), which cannot be sampled either.
     """
     traits = trace.traits
-    hidden = traits.mirrors or traits.veils or traits.splines
+    hidden = traits.veils or traits.splines
     return trace.media is None and not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)
