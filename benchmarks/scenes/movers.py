@@ -192,6 +192,11 @@ def _rough_glass() -> SceneDict:
     return {"type": "cube", "to_world": T().translate([0, 0, 1.2]).scale([1.2, 1.2, 0.1]), "bsdf": glass}
 
 
+def _pane() -> SceneDict:
+    place = T().look_at([0.9, 1.2, 1.0], [0, 0, -0.5], [0, 1, 0]).scale(0.9)
+    return {"type": "rectangle", "to_world": place, "bsdf": {"type": "thindielectric"}}
+
+
 def _fog(extinction: float) -> SceneDict:
     medium = {"type": "homogeneous", "sigma_t": extinction, "albedo": 0.8}
     return {"type": "cube", "to_world": T().scale(0.9), "bsdf": {"type": "null"}, "interior": medium}
@@ -230,6 +235,18 @@ MOVERS: dict[str, Mover] = {
     "wall behind a lamp": Mover(_scene(object=_wall, bulb=_bulb), _slide(1, 0.3, 0)),
     "ball behind a lamp": Mover(
         _scene(wall=_wall, object=lambda: _ball([0, 0, 0], 0.5), bulb=_bulb), _slide(1, 0.3, 0)
+    ),
+    "behind a pane": Mover(
+        _scene(_close, wall=_wall, lamp=_lamp, pane=_pane, object=lambda: _ball([1.15, 1.55, 1.35], 0.25)),
+        _slide(1, 0.3, 0),
+    ),
+    "ball of metal": Mover(
+        _scene(_above, floor=_floor, object=lambda: _ball([0, 0.1, 0], 0.5, {"type": "conductor"}), lamp=_lamp),
+        _slide(1, 0.3, 0),
+    ),
+    "ball of glass": Mover(
+        _scene(_above, floor=_floor, object=lambda: _ball([0, 0.1, 0], 0.5, {"type": "dielectric"}), sky=lambda: SKY),
+        _slide(1, 0.3, 0),
     ),
     "small in a room": Mover(
         _scene(_above, floor=_floor, wall=_wall, object=lambda: _ball([0.3, -0.3, 0.5], 0.06), lamp=_lamp),

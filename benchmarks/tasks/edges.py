@@ -55,6 +55,9 @@ MOVING = {
     "ball in thick fog": (PLACE, 5),
     "wall behind a lamp": (PLACE, 3),
     "ball behind a lamp": (PLACE, 3),
+    "behind a pane": (PLACE, 4),
+    "ball of metal": (PLACE, 4),
+    "ball of glass": (PLACE, 4),
     "small in a room": (PLACE, 3),
 }
 """Scenes for derivatives with respect to one number: the key of the moving parameter, and the depth."""
