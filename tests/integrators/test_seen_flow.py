@@ -30,6 +30,7 @@ from truth import bitmap, noise, translate, turn_vertices
 Write = Callable[[Path], Moving]
 SEEDS, PASSES = 8, 24
 SKY = {"type": "constant", "radiance": 0.8}
+MIRROR = {"type": "conductor"}
 
 
 def texture(**more: Any) -> dict:
@@ -105,6 +106,14 @@ CELLS: dict[str, Write] = {
     ),
     "gaussian": on_a_floor(translate(0, 1, 0), sensor(film=film(rfilter={"type": "gaussian"})), sky=SKY),
     "lens": on_a_floor(translate(1, 0.3, 0), sensor("thinlens", aperture_radius=0.1, focus_distance=3.0)),
+    "before a mirror": on_a_floor(
+        translate(1, 0.3, 0), sensor(place=T().look_at([0, 1, 4], [0, 0, 0], [0, 1, 0])), mirror=wall(MIRROR), sky=SKY
+    ),
+    "beside glass": on_a_floor(
+        translate(1, 0.3, 0),
+        sensor(place=T().look_at([0, 1, 4], [0, 0, 0], [0, 1, 0])),
+        glass={"type": "sphere", "to_world": T().translate([-1, 0, -0.3]).scale(0.45), "bsdf": {"type": "dielectric"}},
+    ),
     "parallel": on_a_floor(
         translate(1, 0.3, 0),
         sensor("orthographic", T().look_at([0, 0.6, 4], [0, 0, 0], [0, 1, 0]).scale([1.3, 1.3, 1])),
@@ -286,19 +295,20 @@ def test_noise_inside_one_colour_falls_with_the_size_of_the_film(monkeypatch: py
     assert 0 < large < small
 
 
-FLOORS: dict[str, tuple[Callable[[], dict], bool]] = {
-    "painted": (lambda: painted(texture()), True),
-    "checks": (lambda: painted({"type": "checkerboard"}), False),
-    "texels": (lambda: painted(texture(filter_type="nearest")), False),
-    "mirror": (lambda: {"type": "conductor"}, False),
-    "veil": (lambda: {"type": "mask", "opacity": 0.5, "nested": grey(0.5, 0.5, 0.5)}, False),
+FLOORS: dict[str, tuple[Callable[[], dict], dict, bool]] = {
+    "painted": (lambda: painted(texture()), SKY, True),
+    "checks": (lambda: painted({"type": "checkerboard"}), SKY, False),
+    "texels": (lambda: painted(texture(filter_type="nearest")), SKY, False),
+    "mirror": (lambda: MIRROR, SKY, True),
+    "mirror under a sun": (lambda: MIRROR, {"type": "sunsky"}, False),
+    "veil": (lambda: {"type": "mask", "opacity": 0.5, "nested": grey(0.5, 0.5, 0.5)}, SKY, False),
 }
 
 
 @pytest.mark.parametrize("name", FLOORS)
 def test_nothing_slides_whose_edges_are_not_found(name: str) -> None:
-    bsdf, follows = FLOORS[name]
-    parts = {"ball": ball(PAINT), "floor": floor(bsdf()), "sky": SKY}
+    bsdf, sky, follows = FLOORS[name]
+    parts = {"ball": ball(PAINT), "floor": floor(bsdf()), "sky": sky}
     scene = mi.load_dict({"type": "scene", "camera": sensor(), **parts})
     params, integrator = mi.traverse(scene), mi.load_dict({"type": "pathreplay"})
     dr.enable_grad(params["ball.to_world"])

@@ -120,8 +120,7 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
 
 def sun_note(trace: TraceConfig) -> str:
     """Format the message about the sun of a `sunsky` in a scene with mirrors or glass; "" without such a sun."""
-    sky = trace.traits.sunsky
-    if sky is None or not mi.traverse(sky)["sun_scale"] > 0 or not any(map(is_specular, trace.traits.mirrors)):
+    if not trace.traits.reflects_sun:
         return ""
     return (
         "something moves in a scene with delta lobes and a sunsky: the motion of the edge of the sun's disc, as seen "

@@ -151,9 +151,10 @@ def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     """Return whether film positions may follow visible surfaces.
 
     Film positions that follow one surface move relative to all other surfaces. The edges of these surfaces must then be
-    sampled, which is impossible behind thin sheets, and for B-spline curves. Media are not supported. The caller must
-    exclude textures with seams (see `has_seams`), which cannot be sampled either.
+    sampled, which is impossible behind thin sheets, for B-spline curves, and for the disc of a sun in mirrors or glass.
+    Media are not supported. The caller must exclude textures with seams (see `has_seams`), which cannot be sampled
+    either.
     """
     traits = trace.traits
-    hidden = traits.veils or traits.splines
+    hidden = traits.veils or traits.splines or traits.reflects_sun
     return trace.media is None and not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)

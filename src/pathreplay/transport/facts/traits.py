@@ -104,6 +104,12 @@ class Traits:
     moving: tuple[mi.Shape, ...] | None = None  # shapes that may move; None: all shapes and the camera
     turning: tuple[mi.Shape, ...] = ()  # static shapes with gradients in a BSDF, medium or emitter: rays may turn there
 
+    @property
+    def reflects_sun(self) -> bool:
+        """Whether mirrors or glass may show the sun of a `sunsky`. The edge of the sun's disc is not sampled there."""
+        sky = self.sunsky
+        return sky is not None and mi.traverse(sky)["sun_scale"] > 0 and any(map(is_specular, self.mirrors))
+
 
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     """Inspect all BSDFs and shapes of a scene, including nested BSDFs and instanced shapes.
