@@ -1,4 +1,6 @@
-"""Probes, compares and records chains. A chain is the first part of a path, which passes only through delta lobes.
+"""Probes, compares and records chains. A chain is a part of a path that passes only through delta lobes.
+
+It starts at the camera, at an emitter or at a scattering vertex.
 
 Two neighbouring chains use the same random numbers, and therefore usually select the same lobes. If a lobe is selected
 with different probabilities on the two chains, the chains may continue along different lobes of the same surface. Such
@@ -61,17 +63,17 @@ def tests_shadows(trace: TraceConfig) -> bool:
 
 @dr.syntax
 def probe_chain(
-    trace: TraceConfig, path: PathState, key: mi.UInt32, moved: mi.Bool, from_vertex: bool = False
+    trace: TraceConfig, path: PathState, key: mi.UInt32, ray_moves: mi.Bool, from_vertex: bool = False
 ) -> VisibilityProbe:
     """Probe a path from its present state to its first vertex without a delta lobe.
 
     Vertices before the first surface that may move are not compared, apart from the first (`VisibilityProbe.still`).
-    In lanes with ``moved``, the first ray may move, so that all surfaces count as moving. Hard shadows that static
+    In lanes with ``ray_moves``, the first ray may move, so that all surfaces count as moving. Hard shadows that static
     surfaces cast onto static surfaces are not compared either. Paths ``from_vertex`` start at a vertex that scatters.
-    Their first hits are not compared, because `secondary` does so.
+    Edges of their first hits, which `secondary` contains, have little importance.
     """
     sampler = CounterSampler.at_vertex(key, path.depth)
-    moves = mi.Bool(moved)
+    moves = mi.Bool(ray_moves)
     if dr.hint(not (trace.traits.mirrors or tests_shadows(trace)), mode="scalar"):
         moves |= may_move(trace, path.at.hit)
         return dr.select(moves, _probe_vertex(trace, path, key, path.active & moves), VisibilityProbe.of())
@@ -89,11 +91,12 @@ def probe_chain(
             vertex_probe.signature = mixed(vertex_probe.signature, dr.select(dark, mi.UInt32(1), 0))
         slides, at_start = _slides(trace, path.at), path.depth == start
         if dr.hint(from_vertex, mode="scalar"):
+            vertex_probe = dr.select(_may_shine(trace, path), vertex_probe, VisibilityProbe.of(1))
             vertex_probe = dr.select(at_start, VisibilityProbe.of(), vertex_probe)
         if dr.hint(trace.to_sensor is not None and trace.to_sensor.caustics, mode="scalar"):
             # A path whose first vertex has no delta lobe carries no caustic.
             vertex_probe = dr.select(at_start & ~slides, VisibilityProbe.of(), vertex_probe)
-        path.active &= slides
+        path.active &= slides & (path.depth - start < MAX_CHAIN)
         u, step = path.choose(trace, sampler)
         step.active &= step.kept.delta
         lobe = dr.select(step.active, step.kept.lobe + 1, 0)
@@ -147,6 +150,14 @@ def _slides(trace: TraceConfig, at: Arrival) -> mi.Bool:
     return valid & mi.has_flag(shape_met(trace, at.hit, at.ray, valid).bsdf().flags(), mi.BSDFFlags.Delta)
 
 
+def _may_shine(trace: TraceConfig, path: PathState) -> mi.Bool:
+    """Return whether light may come from the hit of a path. Where the path has to end, it must be on an emitter."""
+    hit = path.at.hit
+    shape = shape_met(trace, hit, path.at.ray, path.active)
+    glows = dr.select(hit.is_valid(), shape.emitter() != None, trace.scene.environment() is not None)  # noqa: E711
+    return glows | (path.depth + 1 < trace.max_depth)
+
+
 def _shadow_test(trace: TraceConfig, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
     return ShadowTest.of(trace, at, CounterSampler.at_vertex(key, k), k, active)
 
@@ -155,7 +166,7 @@ def _shadow_test(trace: TraceConfig, at: Arrival, key: mi.UInt32, k: mi.UInt32, 
 class ChainSplit:
     """The vertex at which two neighbouring chains diverge."""
 
-    k: mi.UInt32  # number of vertices that the two chains have in common before they diverge
+    k: mi.UInt32  # number of vertices of the two paths before they diverge
     a: Arrival
     b: Arrival
     β: mi.Spectrum  # throughput before the vertex
@@ -166,7 +177,7 @@ class ChainSplit:
 @dr.syntax
 def split_chains(trace: TraceConfig, paths: tuple[PathState, PathState], key: mi.UInt32) -> ChainSplit:
     """Find the first vertex at which two chains with equal random numbers hit different surfaces."""
-    a, b = paths
+    (a, b), start = paths, mi.UInt32(paths[0].depth)
     active = a.active & b.active
     sampler_a, sampler_b = CounterSampler.at_vertex(key, a.depth), CounterSampler.at_vertex(key, b.depth)
     parted = active & _probe_vertex(trace, a, key, active).differs(_probe_vertex(trace, b, key, active))
@@ -175,7 +186,7 @@ def split_chains(trace: TraceConfig, paths: tuple[PathState, PathState], key: mi
         if dr.hint(tests_shadows(trace), mode="scalar"):
             dark_a, dark_b = (_shadow_test(trace, path.at, key, path.depth, go_on).dark for path in (a, b))
             go_on &= dark_a == dark_b
-        go_on &= _slides(trace, a.at)
+        go_on &= _slides(trace, a.at) & (a.depth - start < MAX_CHAIN)
         a.active, b.active = mi.Bool(go_on), mi.Bool(go_on)
         u_a, step_a = a.choose(trace, sampler_a)
         u_b, step_b = b.choose(trace, sampler_b)

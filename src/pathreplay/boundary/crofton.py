@@ -31,8 +31,8 @@ HIDES, BENDS = 0.25, 0.02
 """Importance of an edge between two points of one shape, relative to points of two shapes. BENDS applies if each point
 is in front of the other's tangent plane, or each is behind: in most such cases, the surface is merely curved."""
 STILL = 1 / 16
-"""Importance of an edge, relative to other edges, if the first surfaces of two chains are static and differ. Such an
-edge is static, but the same segment may also cross a moving edge."""
+"""Importance of an edge, relative to other edges, if the first surfaces of two chains differ and their edges do not
+contribute (see `VisibilityProbe.still`). The same segment may also cross another edge."""
 ANGLE = 1e-3
 """Smallest angle between two surfaces, in radians, that counts as an edge."""
 CRACK_BISECTIONS = 8
@@ -65,7 +65,8 @@ class VisibilityProbe:
     triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 1 + index of the visible triangle; 0: none
     light: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the emitter sample, or zero
     lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the BSDF sample, or zero
-    still: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # hash of the first surface; 0 if it may move
+    # Hash of the first surface if its edges do not contribute, because they are static or belong to another search:
+    still: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
 
     @staticmethod
     def of(signature: int | mi.UInt32 | mi.Bool = 0) -> VisibilityProbe:

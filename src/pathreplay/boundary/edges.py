@@ -102,7 +102,7 @@ class Edges:
 
     path: EdgePath
     crossings: Sequence[Crossing]
-    observer: ObserverVertex | None  # the vertex that sees the edge; None for edges on the film
+    observer: ObserverVertex | None  # the vertex that sees the edge; None for edges on the film and behind chains
 
     def motion(self, ray: mi.Ray3f) -> mi.Spectrum:
         """Evaluate - Σ K B over all crossings (Spectrum), differentiable in the path's last ``ray`` and the shapes."""

@@ -57,10 +57,11 @@ class Importance:
         ``scale`` is the product of all factors of the importance that the survey does not contain.
         """
         edges = survey.presence * survey.near * survey.bright * scale
-        return Importance(_finite(survey.presence), _finite(edges), _finite(light))
+        return Importance(finite(survey.presence), finite(edges), finite(light))
 
 
-def _finite(x: mi.Float) -> mi.Float:
+def finite(x: mi.Float) -> mi.Float:
+    """Replace values that are not finite by zero."""
     return dr.select(dr.isfinite(x), x, 0)
 
 

@@ -48,7 +48,7 @@ CHAIN_LENGTH = 0.05  # length of arcs in radians, if they lead through delta lob
 class Boundary(Term):
     """The boundary term, for edges visible from the camera, from surfaces or from points in media.
 
-    The camera may see an edge directly, in mirrors or through glass. Edges in textures and masks are not
+    Camera and surfaces may see an edge directly, in mirrors or through glass. Edges in textures and masks are not
     differentiated, and neither is the alpha channel.
     """
 
@@ -148,7 +148,7 @@ class Boundary(Term):
         if self.inner and trace.max_depth > 1:
             search = SecondarySearch.of(trace, places, INNER_LENGTHS)
             yield from search.find(n, NARROW_CLOSER if search.most_arcs > 1 else INNER_CLOSER, seed)
-            if trace.traits.mirrors and trace.media is None and trace.max_depth > 2 and not trace.follows:
+            if SecondaryChainSearch.applies_to(trace):
                 yield from SecondaryChainSearch.of(trace, places, CHAIN_LENGTH).find(n, INNER_CLOSER, seed)
             if trace.media is not None and trace.traits.hard_lights and trace.max_depth > 2:
                 yield from ScatteredBeamSearch.of(trace, places, INNER_LENGTHS[1]).find(n, INNER_CLOSER, seed)

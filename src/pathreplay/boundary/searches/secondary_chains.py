@@ -28,7 +28,7 @@ from pathreplay.boundary.chains import NEVER, probe_chain, split_chains
 from pathreplay.boundary.creases import off_contact
 from pathreplay.boundary.crofton import VisibilityProbe, bisect, crossing_weight, detect
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
-from pathreplay.boundary.importance import repeated
+from pathreplay.boundary.importance import UNFORESEEN, finite, repeated
 from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.boundary.search import EdgeSearch, SegmentDensity, pilot_size
 from pathreplay.boundary.searches.primary import ChainEdge, FilmCrossing, Sides, behind_edges, jump_between
@@ -40,7 +40,8 @@ from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
 EVERY, ARCS = 4, 8
-"""One in `EVERY` paths is searched, with `ARCS` arcs around a vertex. A path takes longer than an arc."""
+"""The search has 1 / `EVERY` of the usual number of paths, with `ARCS` arcs around a vertex of each. Tracing a path
+costs more than probing an arc."""
 
 
 class ChainArc(Arc):
@@ -68,9 +69,18 @@ class ChainArc(Arc):
         return probe_chain(self.chain, path, self.chain_key, moves, from_vertex=True)
 
     def importance_of_edges(self) -> mi.Float:
-        """Estimate the importance of an edge that crosses this arc."""
+        """Estimate the importance of an edge that crosses this arc.
+
+        The sampled direction may be outside of a narrow lobe that the arc crosses. The importance therefore does not
+        depend on the scattering in this direction alone.
+        """
         presence = detect(self.probe, self.length, self.active) * self.importance()
-        return dr.select(self.active, presence * self.light, 0)
+        light = self.light + UNFORESEEN * dr.mean(dr.abs(self.observer.selected.β))
+        return finite(dr.select(self.active, presence * light, 0))
+
+    def tangent(self, t: mi.Float) -> mi.Vector3f:
+        """Return the direction of the arc at ``t``."""
+        return self.w * dr.cos(t) - self.c * dr.sin(t)
 
 
 @dataclass(frozen=True)
@@ -87,6 +97,14 @@ class SecondaryChainSearch(EdgeSearch[CameraPath]):
 
     def find(self, n: int, closer: int, seed: mi.UInt32) -> Iterator[Edges]:
         return super().find(max(n // EVERY, 1), max(closer // EVERY, 1), seed)
+
+    @staticmethod
+    def applies_to(trace: TraceConfig) -> bool:
+        """Return whether a scene may have such edges and they can be searched.
+
+        If smooth lobes are sampled attached, the replay of a vertex would not continue in the direction to the edge.
+        """
+        return bool(trace.traits.mirrors) and trace.media is None and trace.max_depth > 2 and not trace.follows
 
     def guided(self, n: int, seed: mi.UInt32) -> SecondaryChainSearch:
         """Refine the density of film positions with a pilot pass (see `EdgeSearch`)."""
@@ -115,9 +133,11 @@ class SecondaryChainSearch(EdgeSearch[CameraPath]):
         active = bracket.weight > 0
         d_a, d_b = arc.at(bracket.a), arc.at(bracket.b)
         f, pdf = arc.observer.towards(d_a, active)
-        split = split_chains(chain, (arc.path(bracket.a, pdf, active), arc.path(bracket.b, pdf, active)), key)
+        paths = arc.path(bracket.a, pdf, active), arc.path(bracket.b, pdf, active)
+        split = split_chains(chain, paths, key)
         first = x.depth + 1  # number of vertices before the chain
-        edge = ChainEdge.of(chain, split, active & split.parted & (split.k > first))
+        active = active & arc.observer.is_far(paths[0].at.hit.t) & split.parted & (split.k > first)
+        edge = ChainEdge.of(chain, split, active)
         shadow, (a, b) = edge.crease.shadow, off_contact(chain, split.a, split.b, edge.active)
         lit = split.a if shadow is None else dr.select(shadow.in_a, split.b, split.a)
         sides = Sides(a, b, mi.UInt32(split.k), shadow, lit, edge.active)
@@ -127,7 +147,7 @@ class SecondaryChainSearch(EdgeSearch[CameraPath]):
         d, k = dr.select(edge.near_is_a, d_a, d_b), dr.select(edge.active, split.k - first, 0)
         path, edge.active = self._record(segments, arc, d, pdf, k, edge.near.ray, edge.active)
         slope = self._slope(path, edge, d, dr.select(edge.active, k, 0))
-        K = crossing_weight(d_b - d_a, dr.select(edge.active, L, 0), slope)
+        K = crossing_weight(arc.tangent(bracket.a), dr.select(edge.active, L, 0), slope)
         return Edges(path, [FilmCrossing(K, edge, sides)], None)
 
     def _observer(self, path: CameraPath) -> ObserverVertex:
@@ -136,14 +156,14 @@ class SecondaryChainSearch(EdgeSearch[CameraPath]):
 
     def _arc(self, observer: ObserverVertex, path: CameraPath) -> ChainArc:
         key = key_of(path.number, Stream.ARCS.of(path.key))
-        return ChainArc.draw(observer, self.length, True, key, observer.active)
+        return ChainArc.draw(observer, self.length, self.trace.traits.narrow, key, observer.active)
 
     @dr.syntax
     def _detect_arcs(self, observer: ObserverVertex, path: CameraPath, n: int, importance: mi.Float) -> None:
         """Write the importance of all arcs of ``n`` paths to ``importance``."""
         search, number = self, dr.zeros(mi.UInt32, n)
         while dr.hint(number < ARCS, exclude=[search, observer, path, importance], label="pathreplay: chain arcs"):
-            found = search._arc(observer, replace(path, number=number)).importance_of_edges() / path.density
+            found = search._arc(observer, replace(path, number=number)).importance_of_edges()
             dr.scatter(importance, found, number * n + dr.arange(mi.UInt32, n))
             number += 1
 
@@ -168,8 +188,8 @@ class SecondaryChainSearch(EdgeSearch[CameraPath]):
     ) -> tuple[EdgePath, mi.Bool]:
         """Record the camera path to the vertex of ``arc``, its continuation along ``d``, and the ``k`` vertices behind.
 
-        The ray ``at`` leads from the last vertex to an edge. Returns the recorded path, and the lanes in which the path
-        passes all vertices.
+        Records 0 to x.k belong to the camera path, x.k + 1 and later ones to the chain. The ray ``at`` leads from the
+        last vertex to an edge. Returns the recorded path, and the lanes in which the path passes all vertices.
         """
         trace, x = arc.chain, arc.observer.selected
         layout = Layout.of(trace, True)
