@@ -6,7 +6,7 @@ contribution of the edge to the derivative of the radiance at film position s is
     - Σ K dB/dπ,
 
 summed over the crossings of boundary segments with the edge. K is the weight of a crossing (`Crossing.weight`). A lane
-has one crossing in `primary` and `volumetric`, and up to three in `secondary`. The last ray of the path leads to the
+has up to three crossings in `secondary`, and one in all other searches. The last ray of the path leads to the
 edge. Reverse mode computes the adjoint of this ray, and propagates the adjoint along the records of the path to the
 camera ray. Forward mode propagates the tangent of the camera ray to the last ray.
 """
@@ -80,7 +80,7 @@ class Crossing(Protocol):
         """Evaluate B, which is zero on the edge. B is differentiable in the shapes and in ``at``.
 
         ``at`` is the vertex that sees the edge (`ObserverVertex.moved`). For edges on the film, which have no observer,
-        ``at`` is the last ray of the path.
+        and for edges behind delta lobes, ``at`` is the last ray of the path.
         """
 
 

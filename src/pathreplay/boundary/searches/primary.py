@@ -113,7 +113,7 @@ class ChainEdge:
 
 @dataclass
 class FilmCrossing:
-    """Crossing of a film segment with an edge: see `Crossing`."""
+    """Crossing of a film segment, or of an arc that continues through delta lobes, with an edge: see `Crossing`."""
 
     weight: mi.Spectrum
     edge: ChainEdge

@@ -47,13 +47,14 @@ hardly reduce the noise."""
 class CameraPath:
     """A camera path to a vertex, around which segments are searched for edges.
 
-    One segment lies in the unit square of an emitter. All others are arcs of directions.
+    In this search, one segment lies in the unit square of an emitter, and all others are arcs of directions. All
+    segments of `secondary_chains` are arcs.
     """
 
     s: mi.Point2f  # film position
     density: mi.Float  # density of ``s``, per pixel
     key: mi.UInt32  # seed of the path's random numbers
-    number: mi.UInt32  # the segment that the lane bisects: 0 for the segment in the square, i for the i-th arc
+    number: mi.UInt32  # the segment that the lane bisects; here 0 is the one in the square, i the i-th arc
 
     def vertex(
         self, trace: TraceConfig, film: FilmDomain, shares: mi.Float, layout: Layout | None, records: object
