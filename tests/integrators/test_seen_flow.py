@@ -64,9 +64,25 @@ def moving(key: str, move: Any, camera: dict | None = None, **parts: Any) -> Wri
 
     def write(folder: Path) -> Moving:
         made = {name: part() if callable(part) else part for name, part in parts.items()}
-        return Moving({"type": "scene", "camera": camera or sensor(), **made}, key, move)
+        reference = "volpath" if any("interior" in part for part in made.values()) else "path"
+        return Moving({"type": "scene", "camera": camera or sensor(), **made}, key, move, reference=reference)
 
     return write
+
+
+def fog(σ_t: float, scale: float = 0.5) -> dict:
+    """A ball of fog around the origin."""
+    inside = {"type": "homogeneous", "sigma_t": float(σ_t), "albedo": 0.8}
+    return {"type": "sphere", "to_world": T().scale(scale), "bsdf": {"type": "null"}, "interior": inside}
+
+
+def cloud(filter: str) -> dict:
+    """A grid of densities in a cube behind the ball."""
+    place, grid = T().translate([0.5, 0, -0.6]).scale(0.5), noise(8, 1, 0, 6)[..., None].repeat(8, 2)
+    σ_t = {"type": "gridvolume", "grid": mi.VolumeGrid(grid.astype(np.float32)), "filter_type": filter}
+    σ_t["to_world"] = place.translate([-1, -1, -1]).scale(2)
+    inside = {"type": "heterogeneous", "sigma_t": σ_t, "albedo": 0.8}
+    return {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": inside}
 
 
 def on_a_floor(move: Any, camera: dict, **more: Any) -> Write:
@@ -114,6 +130,9 @@ CELLS: dict[str, Write] = {
         sensor(place=T().look_at([0, 1, 4], [0, 0, 0], [0, 1, 0])),
         glass={"type": "sphere", "to_world": T().translate([-1, 0, -0.3]).scale(0.45), "bsdf": {"type": "dielectric"}},
     ),
+    "in a fog": on_a_floor(translate(1, 0.3, 0), sensor(), fog=fog(0.1, 8)),
+    "before a cloud": on_a_floor(translate(1, 0.3, 0), sensor(), cloud=lambda: cloud("trilinear")),
+    "fog": moving("fog.to_world", translate(1, 0.3, 0), fog=fog(3), floor=floor(PAINT), lamp=panel()),
     "parallel": on_a_floor(
         translate(1, 0.3, 0),
         sensor("orthographic", T().look_at([0, 0.6, 4], [0, 0, 0], [0, 1, 0]).scale([1.3, 1.3, 1])),
@@ -160,6 +179,18 @@ def test_the_gradient_is_that_without_a_flow(name: str, tmp_path: Path, monkeypa
         found.append(np.array([objective.backward(ours, seed, 64) for seed in range(PASSES)]))
     objective.put(dr.opaque(mi.Float, 0))
     assert abs(gap(*found).z) < Z_LIMIT, gap(*found)
+
+
+def test_noise_of_a_fog_that_moves_falls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the outline of a ball of fog, the ends of a fixed ray in the fog move without bounds."""
+    objective = loaded(CELLS["fog"](tmp_path), tmp_path)
+    ours, spread = mi.load_dict({"type": "pathreplay", "max_depth": 3}), []
+    for follows in (True, False):
+        if not follows:
+            monkeypatch.setattr(integrators, "can_follow", lambda trace, sensor: False)
+        spread.append(np.std([objective.backward(ours, seed, 16) for seed in range(16)]))
+    objective.put(dr.opaque(mi.Float, 0))
+    assert spread[0] < 0.7 * spread[1], spread
 
 
 def test_noise_is_below_that_of_a_difference(tmp_path: Path) -> None:
@@ -295,20 +326,23 @@ def test_noise_inside_one_colour_falls_with_the_size_of_the_film(monkeypatch: py
     assert 0 < large < small
 
 
-FLOORS: dict[str, tuple[Callable[[], dict], dict, bool]] = {
-    "painted": (lambda: painted(texture()), SKY, True),
-    "checks": (lambda: painted({"type": "checkerboard"}), SKY, False),
-    "texels": (lambda: painted(texture(filter_type="nearest")), SKY, False),
-    "mirror": (lambda: MIRROR, SKY, True),
-    "mirror under a sun": (lambda: MIRROR, {"type": "sunsky"}, False),
-    "veil": (lambda: {"type": "mask", "opacity": 0.5, "nested": grey(0.5, 0.5, 0.5)}, SKY, False),
+FLOORS: dict[str, tuple[Callable[[], dict], Callable[[], dict], bool]] = {
+    "painted": (lambda: painted(texture()), lambda: {}, True),
+    "checks": (lambda: painted({"type": "checkerboard"}), lambda: {}, False),
+    "texels": (lambda: painted(texture(filter_type="nearest")), lambda: {}, False),
+    "mirror": (lambda: MIRROR, lambda: {}, True),
+    "mirror under a sun": (lambda: MIRROR, lambda: {"sky": {"type": "sunsky"}}, False),
+    "mirror in a fog": (lambda: MIRROR, lambda: {"fog": fog(0.1, 8)}, False),
+    "cloud": (lambda: PAINT, lambda: {"cloud": cloud("trilinear")}, True),
+    "cloud of voxels": (lambda: PAINT, lambda: {"cloud": cloud("nearest")}, False),
+    "veil": (lambda: {"type": "mask", "opacity": 0.5, "nested": grey(0.5, 0.5, 0.5)}, lambda: {}, False),
 }
 
 
 @pytest.mark.parametrize("name", FLOORS)
 def test_nothing_slides_whose_edges_are_not_found(name: str) -> None:
-    bsdf, sky, follows = FLOORS[name]
-    parts = {"ball": ball(PAINT), "floor": floor(bsdf()), "sky": sky}
+    bsdf, more, follows = FLOORS[name]
+    parts = {"ball": ball(PAINT), "floor": floor(bsdf()), "sky": SKY, **more()}
     scene = mi.load_dict({"type": "scene", "camera": sensor(), **parts})
     params, integrator = mi.traverse(scene), mi.load_dict({"type": "pathreplay"})
     dr.enable_grad(params["ball.to_world"])

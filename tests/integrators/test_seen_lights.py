@@ -25,6 +25,12 @@ def with_a_sun() -> dict[str, Any]:
     return {"type": "envmap", "bitmap": mi.Bitmap(texels)}
 
 
+FOG = {
+    "type": "sphere",
+    "radius": 1.5,
+    "bsdf": {"type": "null"},
+    "interior": {"type": "homogeneous", "sigma_t": 0.5},
+}
 SCENES: dict[str, Any] = {
     "lamp": (lambda: {"lamp": lamp(0, 0, 0)}, "shape"),
     "one of many lamps": (
@@ -32,6 +38,7 @@ SCENES: dict[str, Any] = {
         "shape",
     ),
     "back of a lamp": (lambda: {"lamp": lamp(0, 0, 0, 0.5, turned=True)}, ""),
+    "lamp in a fog": (lambda: {"lamp": lamp(0, 0, 0), "fog": FOG}, "shape"),
     "hidden lamp": (lambda: {"lamp": lamp(0, 0, 0), "wall": {"type": "sphere", "radius": 0.5}}, ""),
     "sun": (lambda: {"sky": with_a_sun()}, "sky"),
     "sun over a large floor": (
@@ -69,7 +76,8 @@ def test_lights_are_found(name: str, kind: str) -> None:
     make, expected = SCENES[name]
     lens = {"aperture_radius": 0.01, "focus_distance": 4.0} if kind == "thinlens" else {}
     scene = mi.load_dict({"type": "scene", "camera": camera(kind) | lens, **make()})
-    seen = SeenLights.of(scene, scene.sensors()[0])
+    trace = mi.load_dict({"type": "pathreplay"})._trace_config(scene, scene.sensors()[0])
+    seen = SeenLights.of(trace, scene.sensors()[0])
     found = {"sky": bool(dr.any(seen.sky)), "shape": bool(dr.any(seen.shape))}
     if kind == "orthographic":  # it sees a single point of the sky
         found["sky"] = expected == "sky" and not found["sky"]

@@ -41,6 +41,7 @@ class Moving:
     sensor: int = 0
     optimize: bool = False  # merge meshes while loading, as Mitsuba does unless told otherwise
     options: dict[str, Any] = field(default_factory=dict)  # of both integrators
+    reference: str = "path"
 
 
 Write = Callable[[Path], Moving]
@@ -79,11 +80,11 @@ def loaded(moving: Moving, folder: Path) -> Objective:
 
 
 def measured(moving: Moving, folder: Path, seeds: int = 8, **options: Any) -> Measured:
-    """Interior and edges, by reverse mode, and finite differences of Mitsuba's `path`; ``options`` are for ours."""
+    """Interior and edges, by reverse mode, and finite differences of Mitsuba's images; ``options`` are for ours."""
     objective = loaded(moving, folder)
     common = {"max_depth": moving.depth, "rr_depth": NEVER, **moving.options}
     ours = mi.load_dict({"type": "pathreplay", "boundary": "all", **common, **options})
-    plain = mi.load_dict({"type": "path", **common, "rr_depth": NEVER})
+    plain = mi.load_dict({"type": moving.reference, **common, "rr_depth": NEVER})
     numbers = range(1, seeds + 1)
     try:
         g = np.array([objective.backward(ours, seed, moving.spp) for seed in numbers])
@@ -106,7 +107,7 @@ def hold_quiet(moving: Moving, folder: Path, passes: int = 24, spp: int = 32, mo
     """
     objective = loaded(moving, folder)
     ours = mi.load_dict({"type": "pathreplay", "max_depth": moving.depth})
-    plain = mi.load_dict({"type": "path", "max_depth": moving.depth, "rr_depth": NEVER})
+    plain = mi.load_dict({"type": moving.reference, "max_depth": moving.depth, "rr_depth": NEVER})
     g = [objective.backward(ours, seed, spp) for seed in range(passes)]
     d = [objective.dot(objective.difference(plain, CENTRAL, moving.step, seed, spp)) for seed in range(passes)]
     objective.put(dr.opaque(mi.Float, 0))

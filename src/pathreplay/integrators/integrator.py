@@ -206,7 +206,7 @@ class PathReplayIntegrator(PathIntegrator):
         view, trace, terms = PathIntegrator._planned(self, view, state)
         if self.boundary == "none":
             return view, trace, terms
-        view = replace(view, flow=CameraFlow.of(view.scene, view.sensor))
+        view = replace(view, flow=CameraFlow.of(trace, view.sensor))
         needs_edges = self._needs_edges(view, Boundary.move(view, trace))
         if needs_edges:
             Boundary.require(view, self.boundary_spp)
@@ -228,7 +228,9 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
         """Return whether film positions may follow visible surfaces, which requires that all edges can be sampled."""
-        return self.boundary != "primary" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
+        facts = facts_of(view.scene)
+        jumps = facts.has_seams or facts.has_steps
+        return self.boundary != "primary" and can_follow(trace, view.sensor) and not jumps
 
     def _needs_edges(self, view: Pass, move: bool) -> bool:
         """Return whether edges ``move``. With ``boundary = 'auto'``, return False if no boundary term can be computed.

@@ -16,7 +16,7 @@ from pathreplay.transport.facts.dark_texels import DarkTexels
 from pathreplay.transport.facts.facets import Facets
 from pathreplay.transport.facts.lobe_choice import LobeChoice
 from pathreplay.transport.facts.nodes import is_mesh, nodes_of, plain_numbers, with_gradients
-from pathreplay.transport.facts.seams import has_seams
+from pathreplay.transport.facts.seams import has_seams, has_steps
 from pathreplay.transport.facts.traits import (
     BLEND,
     INSTANCE,
@@ -65,7 +65,9 @@ class SceneFacts:
         self._plastics = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == PLASTIC]
         self._splines = [s for s in self._shapes if s.shape_type() == mi.ShapeType.BSplineCurve]
         self._textures = [node for node in nodes if isinstance(node, mi.Texture)]
+        self._volumes = [node for node in nodes if isinstance(node, mi.Volume)]
         self._seams: bool | None = None
+        self._steps: bool | None = None
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
         self._bounded = any(shape.is_medium_transition() for shape in self._shapes)
         self._bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
@@ -92,6 +94,13 @@ class SceneFacts:
         if self._seams is None and not is_recording():
             self._seams = has_seams(self._textures)
         return self._seams is not False
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether a volume has discontinuities. True in a recording, unless an earlier pass found no discontinuity."""
+        if self._steps is None and not is_recording():
+            self._steps = has_steps(self._volumes)
+        return self._steps is not False
 
     @cached_property
     def has_wrapping_textures(self) -> bool:

@@ -43,6 +43,7 @@ from pathreplay.integrators.film.sample import (
     ray_derivatives,
 )
 from pathreplay.transport.facts.nodes import with_gradients
+from pathreplay.transport.vertex import TraceConfig
 
 ONLY_POSITIONS = "x_fov", "principal_point_offset_x", "principal_point_offset_y"
 """Camera parameters that only move rays to other film positions. The film flow contains all motion of such rays."""
@@ -97,16 +98,17 @@ class CameraFlow:
     samples: int = 2
 
     @staticmethod
-    def of(scene: mi.Scene, sensor: mi.Sensor) -> CameraFlow | None:
+    def of(trace: TraceConfig, sensor: mi.Sensor) -> CameraFlow | None:
         """Create the flow of a sensor. None if the sensor has no gradients or its class is not one of `CAMERAS`."""
         if sensor.class_name() not in CAMERAS or not with_gradients(sensor, *ONLY_POSITIONS, *OTHERS):
             return None
         rest = _is_carried(sensor) or bool(with_gradients(sensor, *OTHERS[1:]))
+        scene = trace.scene
         others = any(with_gradients(node) for node in (*scene.shapes(), *scene.emitters()))
         alone = not (rest or others or with_gradients(sensor, "medium"))
         if not rest:  # the flow does not depend on the distance
             return CameraFlow(sensor, dr.full(mi.Float, 1, NODES * NODES), mi.Float(1), rest, alone)
-        closeness = _closeness(scene, sensor)
+        closeness = _closeness(trace, sensor)
         mean = dr.mean(closeness)
         mean = dr.select(mean > 0, mean, 1)
         dr.eval(mean)
@@ -184,17 +186,17 @@ def _is_carried(sensor: mi.Sensor) -> bool:
         return any(dr.grad_enabled(pose.matrix[row, 3]) for pose in poses for row in range(3))
 
 
-def _closeness(scene: mi.Scene, sensor: mi.Sensor) -> mi.Float:
+def _closeness(trace: TraceConfig, sensor: mi.Sensor) -> mi.Float:
     """Return the mean of the reciprocal distances of the surfaces that are visible near each node (see `grid`).
 
     Parallax is proportional to reciprocal distances. Rays that miss all surfaces do not count: edges move with the
     surfaces in front of a background, and a background has no edges of its own. Bright parts of the sky have no
     parallax (see `lights`): their closeness is zero.
     """
-    seen = SeenLights.of(scene, sensor)
+    seen = SeenLights.of(trace, sensor)
     with dr.suspend_grad():
         ray, _ = probes_of(sensor).ray(sensor)
-        hit = scene.ray_intersect_preliminary(ray, coherent=True)
+        hit = trace.scene.ray_intersect_preliminary(ray, coherent=True)
         visible = hit.is_valid()
         closeness = dr.select(visible, dr.rcp(hit.t), 0)
         mean = dr.sum(closeness) / dr.maximum(dr.count(visible), 1)

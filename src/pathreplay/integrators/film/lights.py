@@ -14,9 +14,18 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.integrators.film.grid import CELLS, REACH, distance_to
-from pathreplay.integrators.film.sample import ORTHOGRAPHIC, Sample, film_velocity, probes_of, ray_derivatives
+from pathreplay.integrators.film.sample import (
+    ORTHOGRAPHIC,
+    Sample,
+    film_velocity,
+    probes_of,
+    ray_derivatives,
+)
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.transport.meet import meet
+from pathreplay.transport.vertex import TraceConfig
+from pathreplay.transport.volume.passage import skip_null
 
 BRIGHT = 2.0
 """Density per steradian of an emitter's samples above which a part of the sky is bright; uniform samples have 0.08."""
@@ -36,8 +45,9 @@ class SeenLights:
     shape: mi.Bool  # a shape that emits light towards the camera is visible
 
     @staticmethod
-    def of(scene: mi.Scene, sensor: mi.Sensor) -> SeenLights:
+    def of(trace: TraceConfig, sensor: mi.Sensor) -> SeenLights:
         """Test the positions of probe rays, and positions at which points of emitters would be visible; detached."""
+        scene = trace.scene
         with dr.suspend_grad():
             sample = probes_of(sensor)
             probes = dr.width(sample.position)
@@ -47,7 +57,9 @@ class SeenLights:
             inside = dr.concat([dr.full(mi.Bool, True, probes), inside])
             bright = dr.concat([dr.full(mi.Bool, False, probes), bright])
             ray = mi.Ray3f(sample.at(position).ray(sensor)[0])
-            hit = scene.ray_intersect_preliminary(ray, coherent=False, active=inside)
+            hit = meet(trace, ray, inside)
+            if trace.media is not None:
+                hit = skip_null(trace, ray, hit, inside)
             met = inside & hit.is_valid()
             si = hit.compute_surface_interaction(ray, compat.minimal(), met)
             glows = dr.any(si.emitter(scene, met).eval(si, met) > 0)

@@ -70,6 +70,8 @@ class SurfaceFlow:
     def of(sensor: mi.Sensor, trace: TraceConfig) -> SurfaceFlow | None:
         """Create the flow of a sensor; None if no visible surface moves. ``trace`` contains the moving shapes."""
         sample = probes_of(sensor)
+        if trace.traits.moving is None:  # `may_move` would return True in all lanes
+            trace = replace(trace, traits=replace(trace.traits, moving=shapes_with_gradients(trace.scene)))
         ray = mi.Ray3f(sample.ray(sensor)[0])
         hit = meet(trace, ray, mi.Bool(True), coherent=True)
         visible, t = hit.is_valid(), dr.select(hit.is_valid(), hit.t, 1)
@@ -78,8 +80,6 @@ class SurfaceFlow:
             si = hit.compute_surface_interaction(ray, flags, visible)
             if not (dr.grad_enabled(si.p) and have_gradients(trace.scene, mi.Shape)):
                 return None
-            if trace.traits.moving is None:  # `may_move` would return True in all lanes
-                trace = replace(trace, traits=replace(trace.traits, moving=shapes_with_gradients(trace.scene)))
             derivatives = ray_derivatives(sensor, sample)
             cos, step = dr.dot(dr.detach(si.n), ray.d), derivatives[0][0] + t * derivatives[1][0]
             grazing, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / dr.squared_norm(step)
@@ -143,7 +143,7 @@ def _away_from_lights(trace: TraceConfig, sensor: mi.Sensor) -> mi.Float:
     """Return the share of the flow that is kept at each node: 0 near static lights that are visible, see `lights`."""
     if trace.hide_emitters:
         return mi.Float(1)
-    seen = SeenLights.of(trace.scene, sensor)
+    seen = SeenLights.of(trace, sensor)
     return seen.share_kept(seen.sky | (seen.shape & ~may_move(trace, seen.hit)))
 
 
@@ -151,10 +151,10 @@ def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     """Return whether film positions may follow visible surfaces.
 
     Film positions that follow one surface move relative to all other surfaces. The edges of these surfaces must then be
-    sampled, which is impossible behind thin sheets, for B-spline curves, and for the disc of a sun in mirrors or glass.
-    Media are not supported. The caller must exclude textures with seams (see `has_seams`), which cannot be sampled
-    either.
+    sampled, which is impossible behind thin sheets, for B-spline curves, for the disc of a sun in mirrors or glass, and
+    in scenes with media for edges that scattering points see in mirrors or glass. The caller must exclude textures and
+    volumes with discontinuities (see `seams`), which cannot be sampled either.
     """
     traits = trace.traits
-    hidden = traits.veils or traits.splines or traits.reflects_sun
-    return trace.media is None and not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)
+    hidden = traits.veils or traits.splines or traits.reflects_sun or (trace.media is not None and traits.mirrors)
+    return not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)

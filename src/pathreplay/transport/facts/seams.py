@@ -1,8 +1,9 @@
-"""Textures with discontinuities: checkerboards, bitmaps with nearest-neighbour lookup, face attributes of meshes.
+"""Textures and volumes with discontinuities.
 
-Boundary terms do not cover these discontinuities. With `SurfaceFlow`, the film positions of camera rays move with the
-visible surfaces. A camera ray that moves would cross the discontinuities of textures on static surfaces. Film positions
-therefore do not move in a scene with such a texture.
+These are checkerboards, bitmaps and grids with nearest-neighbour lookup, and face attributes of meshes. Boundary terms
+do not cover these discontinuities. With `SurfaceFlow`, the film positions of camera rays move with the visible
+surfaces. A camera ray that moves would cross the discontinuities of static textures and volumes. Film positions
+therefore do not move in a scene with such a texture or volume.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Iterable
 import drjit as dr
 import mitsuba as mi
 
-CHECKERBOARD, BITMAP, ATTRIBUTE = "Checkerboard", "BitmapTextureImpl", "MeshAttribute"
+CHECKERBOARD, BITMAP, ATTRIBUTE, GRID = "Checkerboard", "BitmapTextureImpl", "MeshAttribute", "GridVolume"
 """Class names. The class name of a bitmap begins with BITMAP and ends with the texel type."""
 WAVELENGTHS = 440.0, 510.0, 580.0, 650.0
 
@@ -20,6 +21,22 @@ WAVELENGTHS = 440.0, 510.0, 580.0, 650.0
 def has_seams(textures: Iterable[mi.Texture]) -> bool:
     """Return whether a texture is discontinuous. Bitmaps are evaluated, because they do not expose their filter."""
     return any(map(_has_seams, textures))
+
+
+def has_steps(volumes: Iterable[mi.Volume]) -> bool:
+    """Return whether a grid uses nearest-neighbour lookup. Grids do not expose their filter, so they are evaluated."""
+    return any(volume.class_name() == GRID and _has_steps(volume) for volume in volumes)
+
+
+def _has_steps(grid: mi.Volume) -> bool:
+    it = dr.zeros(mi.Interaction3f)
+    if mi.is_spectral:
+        it.wavelengths = type(it.wavelengths)(*WAVELENGTHS)
+    with dr.resume_grad():
+        dr.enable_grad(it.p)
+    with dr.suspend_grad(), dr.resume_grad(it.p):  # the voxels may have gradients, too
+        values = grid.eval(it) if grid.channel_count() in (1, 3) else grid.eval_n(it)
+        return not dr.grad_enabled(values)
 
 
 def _has_seams(texture: mi.Texture) -> bool:
