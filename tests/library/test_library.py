@@ -788,8 +788,9 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
             pathreplay.minimize(problem, optimizer, progress=False)
     with pytest.raises(PathreplayError, match="No parameter 'x'"):
         problem.render({"x": 1.0})
-    with pytest.raises(PathreplayError, match="is 'red'; give an array of numbers"):
-        problem.render({WALL: "red"})
+    for value, shown in (("red", "'red'"), (10**400, "1000")):
+        with pytest.raises(PathreplayError, match=f"is {shown}.*; give an array of numbers"):
+            problem.render({WALL: value})
     with pytest.raises(PathreplayError, match="is not a scene of the active variant"):
         problem.assign(problem.initial, room())
     with pytest.raises(PathreplayError, match=r"has the shape \(2,\), not the shape \(3,\); reshape it"):
@@ -805,6 +806,7 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
         (None, "beta_1", r'optimizer=\{"type": "adam", "beta_1": 0.5\}'),
         ({"type": "sgd"}, "momentum", r'optimizer=\{"type": "sgd", "momentum": 0.5\}'),
         ("adam", "momentum", r'optimizer=\{"type": "sgd", "momentum": 0.5\}'),
+        ({"type": "adam", "beta_2": 0.9}, "beta_1", r'optimizer=\{"type": "adam", "beta_2": 0.9, "beta_1": 0.5\}'),
         (mi.ad.Adam(lr=0.1), "beta_1", "give it to the optimizer object"),
     ):
         with pytest.raises(PathreplayError, match=f"minimize: '{key}' is an option of the optimizer; .*{told}"):

@@ -162,6 +162,13 @@ def test_what_a_shared_parameter_has_in_one_scene_only_is_told() -> None:
     made = [problem_of(regularizer=lambda values: lighter(values)) for _ in range(2)]
     with pytest.raises(PathreplayError, match="is one function 'lambda' in problem 0 and another in problem 1; create"):
         Problem.joint(made)
+    functions = [lambda values: lighter(values), lambda values: 2 * lighter(values)]  # of one name
+    made = [Parameter(initial=0.5, bounds=(0, 1), regularizer=function) for function in functions]
+    pair = [
+        Problem(room(), keys, View("left", photos[0]))
+        for keys in ({WALL: made[0], TEXTURE: made[1]}, {TEXTURE: made[1]})
+    ]
+    assert set(Problem.joint(pair).initial) == {WALL, TEXTURE}
     moved = [
         Problem(room(), {BODY: Parameter(pose="translation", initial={"translation": [x, 0, 0]})}, views(photos))
         for x in (0.0, 0.5)

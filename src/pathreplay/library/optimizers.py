@@ -240,6 +240,7 @@ def require_no_options(name: str, settings: Mapping[str, object], optimizer: obj
     if own is not None:
         raise PathreplayError(f"{name}: '{found}' is an option of the optimizer; give it to the optimizer object")
     kinds = [kind for kind, of_kind in DEFAULTS.items() if found in of_kind]
-    kind = known.type if options is None else options["type"]
-    mapping = f'{{"type": "{kind if kind in kinds else kinds[0]}", "{found}": {shown(settings[found])}}}'
-    raise PathreplayError(f"{name}: '{found}' is an option of the optimizer; write optimizer={mapping}")
+    options = {"type": known.type} if options is None else options
+    kept = options if options["type"] in kinds else {"type": kinds[0]}
+    mapping = ", ".join(f'"{key}": {shown(value)}' for key, value in {**kept, found: settings[found]}.items())
+    raise PathreplayError(f"{name}: '{found}' is an option of the optimizer; write optimizer={{{mapping}}}")

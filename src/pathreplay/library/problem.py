@@ -355,7 +355,7 @@ def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
     try:
         with np.errstate(over="ignore"):  # values beyond single precision become infinite, and are refused below
             array = np.array(value, np.float32)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise PathreplayError(f"Value of '{key}' is {shown(value)}; give an array of numbers") from None
     require_finite_array(f"Value of '{key}'", array)
     if array.ndim == 0 and not key.endswith(PART_NAMES):

@@ -53,7 +53,9 @@ def require_alike(parts: Sequence[Part]) -> None:
             options, function = _options(entry), part.functions.get(entry.regularizer or "", entry.regularizer)
             before, others, other = known.setdefault(key, (n, options, function))
             for name, value in options.items():
-                if name == "regularizer" and other != function and others[name] == value:
+                if name == "regularizer" and other == function:
+                    continue
+                if name == "regularizer" and others[name] == value:
                     raise PathreplayError(
                         f"problems: parameter '{key}': 'regularizer' is one function {shown(value)} in problem "
                         f"{before} and another in problem {n}; create the problems with the same function"
