@@ -26,6 +26,7 @@ from pathreplay.testing.verdict import Z_LIMIT
 from pathreplay.transport.facts.nodes import nodes_of
 from pathreplay.transport.facts.seams import has_seams
 from truth import bitmap, noise, translate, turn_vertices
+from variant import VARIANT
 
 Write = Callable[[Path], Moving]
 SEEDS, PASSES = 8, 24
@@ -65,7 +66,7 @@ def moving(key: str, move: Any, camera: dict | None = None, **parts: Any) -> Wri
     def write(folder: Path) -> Moving:
         made = {name: part() if callable(part) else part for name, part in parts.items()}
         reference = "volpath" if any("interior" in part for part in made.values()) else "path"
-        return Moving({"type": "scene", "camera": camera or sensor(), **made}, key, move, reference=reference)
+        return Moving({"type": "scene", **made, "camera": camera or sensor()}, key, move, reference=reference)
 
     return write
 
@@ -89,6 +90,14 @@ def on_a_floor(move: Any, camera: dict, **more: Any) -> Write:
     """A ball that moves over a floor, and its shadow."""
     parts = {"ball": ball(PAINT), "floor": floor(PAINT), "lamp": panel(), **more}
     return moving("ball.to_world", move, camera, **parts)
+
+
+def in_a_fog(**more: Any) -> Write:
+    """The camera, the ball and its floor are in it."""
+    haze = {"type": "homogeneous", "sigma_t": 0.15, "albedo": 0.8, "id": "haze"}
+    same = {"type": "ref", "id": "haze"}
+    around = {**fog(0, 8), "interior": same}
+    return on_a_floor(translate(1, 0.3, 0), sensor(medium=same), **{"haze": haze, "around": around, **more})
 
 
 def test_the_divergence_is_that_of_the_velocity_beyond_the_grid_as_well() -> None:
@@ -130,7 +139,8 @@ CELLS: dict[str, Write] = {
         sensor(place=T().look_at([0, 1, 4], [0, 0, 0], [0, 1, 0])),
         glass={"type": "sphere", "to_world": T().translate([-1, 0, -0.3]).scale(0.45), "bsdf": {"type": "dielectric"}},
     ),
-    "in a fog": on_a_floor(translate(1, 0.3, 0), sensor(), fog=fog(0.1, 8)),
+    "in a fog": in_a_fog(),
+    "in a beam": in_a_fog(lamp={"type": "point", "position": [1, 1, 2], "intensity": 4.0}),
     "before a cloud": on_a_floor(translate(1, 0.3, 0), sensor(), cloud=lambda: cloud("trilinear")),
     "fog": moving("fog.to_world", translate(1, 0.3, 0), fog=fog(3), floor=floor(PAINT), lamp=panel()),
     "parallel": on_a_floor(
@@ -333,6 +343,9 @@ FLOORS: dict[str, tuple[Callable[[], dict], Callable[[], dict], bool]] = {
     "mirror": (lambda: MIRROR, lambda: {}, True),
     "mirror under a sun": (lambda: MIRROR, lambda: {"sky": {"type": "sunsky"}}, False),
     "mirror in a fog": (lambda: MIRROR, lambda: {"fog": fog(0.1, 8)}, False),
+    "projector in a fog": (lambda: PAINT, lambda: {"fog": fog(0.1, 8), "light": {"type": "projector"}}, False),
+    "spot in a fog": (lambda: PAINT, lambda: {"fog": fog(0.1, 8), "light": {"type": "spot"}}, False),
+    "spot": (lambda: PAINT, lambda: {"light": {"type": "spot"}}, True),
     "cloud": (lambda: PAINT, lambda: {"cloud": cloud("trilinear")}, True),
     "cloud of voxels": (lambda: PAINT, lambda: {"cloud": cloud("nearest")}, False),
     "veil": (lambda: {"type": "mask", "opacity": 0.5, "nested": grey(0.5, 0.5, 0.5)}, lambda: {}, False),
@@ -363,6 +376,28 @@ def test_bitmaps_without_interpolation_are_found(filter: str, shape: tuple[int, 
     painting = {"type": "bitmap", "raw": True, "data": mi.TensorXf(texels), "filter_type": filter, **more}
     body = mi.load_dict({"type": "rectangle", "bsdf": painted(painting)})
     assert has_seams(node for node in nodes_of(body) if isinstance(node, mi.Texture)) is (filter == "nearest")
+
+
+STEPS = """
+import sys
+import pathreplay
+import mitsuba as mi
+import numpy as np
+from pathreplay.transport.facts.seams import has_steps
+
+mi.set_variant(sys.argv[1])
+for raw, channels in ((True, 1), (True, 3), (True, 6), (False, 1), (False, 3)):
+    for filter in ("nearest", "trilinear"):
+        grid = mi.VolumeGrid(np.full((4, 4, 4, channels), 0.5, np.float32))
+        volume = mi.load_dict({"type": "gridvolume", "grid": grid, "raw": raw, "filter_type": filter})
+        assert has_steps([volume]) is (filter == "nearest"), (raw, channels, filter)
+"""
+
+
+@pytest.mark.parametrize("variant", [VARIANT, VARIANT.replace("_rgb", "_spectral")])
+def test_grids_without_interpolation_are_found(variant: str, run_python: Any) -> None:
+    done = run_python(STEPS, args=(variant,))
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("filter", ["bilinear", "nearest"])

@@ -228,9 +228,10 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
         """Return whether film positions may follow visible surfaces, which requires that all edges can be sampled."""
+        if self.boundary == "primary" or not can_follow(trace, view.sensor):
+            return False
         facts = facts_of(view.scene)
-        jumps = facts.has_seams or facts.has_steps
-        return self.boundary != "primary" and can_follow(trace, view.sensor) and not jumps
+        return not (facts.has_seams or facts.has_steps)
 
     def _needs_edges(self, view: Pass, move: bool) -> bool:
         """Return whether edges ``move``. With ``boundary = 'auto'``, return False if no boundary term can be computed.

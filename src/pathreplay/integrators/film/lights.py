@@ -14,13 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.integrators.film.grid import CELLS, REACH, distance_to
-from pathreplay.integrators.film.sample import (
-    ORTHOGRAPHIC,
-    Sample,
-    film_velocity,
-    probes_of,
-    ray_derivatives,
-)
+from pathreplay.integrators.film.sample import ORTHOGRAPHIC, Sample, film_velocity, probes_of, ray_derivatives
 from pathreplay.platform import compat
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.transport.meet import meet
@@ -58,19 +52,27 @@ class SeenLights:
             bright = dr.concat([dr.full(mi.Bool, False, probes), bright])
             ray = mi.Ray3f(sample.at(position).ray(sensor)[0])
             hit = meet(trace, ray, inside)
+            glows = _shines(trace, ray, hit, inside)
             if trace.media is not None:
-                hit = skip_null(trace, ray, hit, inside)
+                behind = skip_null(trace, ray, hit, inside)
+                hit = dr.select(glows, hit, behind)
+                glows |= _shines(trace, ray, behind, inside)
             met = inside & hit.is_valid()
-            si = hit.compute_surface_interaction(ray, compat.minimal(), met)
-            glows = dr.any(si.emitter(scene, met).eval(si, met) > 0)
             passes = ~met | mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Null)  # the sky is visible
-            sky, shape = inside & bright & passes, met & glows
+            sky, shape = inside & bright & passes, glows
             dr.eval(position, hit, sky, shape)
             return SeenLights(position, hit, sky, shape)
 
     def share_kept(self, near: mi.Bool) -> mi.Float:
         """Return the share of a flow that remains at each node of the grid: 0 near the lights in the lanes ``near``."""
         return dr.square(dr.clip((distance_to(self.position, near) - AWAY) / REACH, 0, 1))
+
+
+def _shines(trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
+    """Return whether the surface that a ray hits emits light towards the origin of the ray."""
+    met = active & hit.is_valid()
+    si = hit.compute_surface_interaction(ray, compat.minimal(), met)
+    return met & dr.any(si.emitter(trace.scene, met).eval(si, met) > 0)
 
 
 def _emitters_on_film(

@@ -151,10 +151,14 @@ def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     """Return whether film positions may follow visible surfaces.
 
     Film positions that follow one surface move relative to all other surfaces. The edges of these surfaces must then be
-    sampled, which is impossible behind thin sheets, for B-spline curves, for the disc of a sun in mirrors or glass, and
-    in scenes with media for edges that scattering points see in mirrors or glass. The caller must exclude textures and
-    volumes with discontinuities (see `seams`), which cannot be sampled either.
+    sampled, which is impossible behind thin sheets, for B-spline curves, and for the disc of a sun in mirrors or glass.
+    In scenes with media, it is also impossible in mirrors and glass, behind hidden emitters, and for the borders of the
+    light of projectors and spots. The caller must exclude textures and volumes with discontinuities (see `seams`),
+    which cannot be sampled either. The borders of open null boundaries are not sampled, but not excluded.
     """
     traits = trace.traits
-    hidden = traits.veils or traits.splines or traits.reflects_sun or (trace.media is not None and traits.mirrors)
+    hidden = traits.veils or traits.splines or traits.reflects_sun
+    if trace.media is not None:
+        hidden |= bool(traits.mirrors or traits.projectors or traits.spots)
+        hidden |= trace.hide_emitters and traits.area_lights
     return not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)

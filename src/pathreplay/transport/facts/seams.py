@@ -35,8 +35,10 @@ def _has_steps(grid: mi.Volume) -> bool:
     with dr.resume_grad():
         dr.enable_grad(it.p)
     with dr.suspend_grad(), dr.resume_grad(it.p):  # the voxels may have gradients, too
-        values = grid.eval(it) if grid.channel_count() in (1, 3) else grid.eval_n(it)
-        return not dr.grad_enabled(values)
+        channels = mi.traverse(grid)["data"].shape[3]
+        if channels == 3 and mi.is_spectral:  # a raw grid, since Mitsuba converts colours to spectra of 4 channels
+            return not dr.grad_enabled(grid.eval_3(it))
+        return not dr.grad_enabled(grid.eval(it) if channels in (1, 3, 4) else grid.eval_n(it))
 
 
 def _has_seams(texture: mi.Texture) -> bool:
