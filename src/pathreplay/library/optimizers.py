@@ -242,5 +242,8 @@ def require_no_options(name: str, settings: Mapping[str, object], optimizer: obj
     kinds = [kind for kind, of_kind in DEFAULTS.items() if found in of_kind]
     options = {"type": known.type} if options is None else options
     kept = options if options["type"] in kinds else {"type": kinds[0]}
-    mapping = ", ".join(f'"{key}": {shown(value)}' for key, value in {**kept, found: settings[found]}.items())
-    raise PathreplayError(f"{name}: '{found}' is an option of the optimizer; write optimizer={{{mapping}}}")
+    others = "".join(
+        f', "{key}": {shown(value)}' for key, value in {**kept, found: settings[found]}.items() if key != "type"
+    )
+    mapping = f'{{"type": "{kept["type"]}"{others}}}'
+    raise PathreplayError(f"{name}: '{found}' is an option of the optimizer; write optimizer={mapping}")
