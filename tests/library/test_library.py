@@ -927,7 +927,7 @@ def test_a_number_is_the_value_of_all_entries(photos: list[np.ndarray]) -> None:
 
 
 def test_targets_of_grey_and_with_alpha(photos: list[np.ndarray]) -> None:
-    """Grey stands for three equal channels. The colours of arrays with alpha are those of renderings: multiplied."""
+    """A grey target has three equal channels. Arrays with alpha have premultiplied colours, as renderings do."""
     grey, alpha = photos[0][:, :, 1], np.full((SIDE, SIDE, 1), 0.5, np.float32)
     for target, expected in (
         (grey, np.dstack([grey] * 3)),

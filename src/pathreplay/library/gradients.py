@@ -66,7 +66,7 @@ def value_and_grad(problem: Problem) -> ValueAndGrad:
             if variable.penalty is not None:
                 value, slope = variable.penalty.of(at[variable.key])
                 loss, gradients[variable.key] = loss + value, gradients[variable.key] + slope
-        if not np.isfinite(loss):  # finite gradients would look like those of a valid loss, and zeros like a minimum
+        if not np.isfinite(loss):  # finite gradients would hide the error
             gradients = {key: np.full_like(gradient, np.nan) for key, gradient in gradients.items()}
         return loss, gradients
 

@@ -103,8 +103,7 @@ class CameraFlow:
         if sensor.class_name() not in CAMERAS or not with_gradients(sensor, *ONLY_POSITIONS, *OTHERS):
             return None
         rest = _is_carried(sensor) or bool(with_gradients(sensor, *OTHERS[1:]))
-        scene = trace.scene
-        others = any(with_gradients(node) for node in (*scene.shapes(), *scene.emitters()))
+        others = any(with_gradients(node) for node in (*trace.scene.shapes(), *trace.scene.emitters()))
         alone = not (rest or others or with_gradients(sensor, "medium"))
         if not rest:  # the flow does not depend on the distance
             return CameraFlow(sensor, dr.full(mi.Float, 1, NODES * NODES), mi.Float(1), rest, alone)
