@@ -60,13 +60,13 @@ def box(bsdf: dict) -> dict:
     }
 
 
-def moving(key: str, move: Any, camera: dict | None = None, **parts: Any) -> Write:
+def moving(key: str, move: Any, camera: dict | None = None, depth: int = 3, **parts: Any) -> Write:
     """Parts that are functions are made anew for each scene."""
 
     def write(folder: Path) -> Moving:
         made = {name: part() if callable(part) else part for name, part in parts.items()}
         reference = "volpath" if any("interior" in part for part in made.values()) else "path"
-        return Moving({"type": "scene", **made, "camera": camera or sensor()}, key, move, reference=reference)
+        return Moving({"type": "scene", **made, "camera": camera or sensor()}, key, move, depth, reference=reference)
 
     return write
 
@@ -139,6 +139,9 @@ CELLS: dict[str, Write] = {
         sensor(place=T().look_at([0, 1, 4], [0, 0, 0], [0, 1, 0])),
         glass={"type": "sphere", "to_world": T().translate([-1, 0, -0.3]).scale(0.45), "bsdf": {"type": "dielectric"}},
     ),
+    "glass": moving(
+        "ball.to_world", translate(1, 0.3, 0), depth=4, ball=ball({"type": "dielectric"}), floor=floor(PAINT), sky=SKY
+    ),
     "in a fog": in_a_fog(),
     "in a beam": in_a_fog(lamp={"type": "point", "position": [1, 1, 2], "intensity": 4.0}),
     "before a cloud": on_a_floor(translate(1, 0.3, 0), sensor(), cloud=lambda: cloud("trilinear")),
@@ -203,8 +206,9 @@ def test_noise_of_a_fog_that_moves_falls(tmp_path: Path, monkeypatch: pytest.Mon
     assert spread[0] < 0.7 * spread[1], spread
 
 
-def test_noise_is_below_that_of_a_difference(tmp_path: Path) -> None:
-    hold_quiet(CELLS[QUICK](tmp_path), tmp_path, **FEW)
+@pytest.mark.parametrize("name", [QUICK, "glass"])
+def test_noise_is_below_that_of_a_difference(name: str, tmp_path: Path) -> None:
+    hold_quiet(CELLS[name](tmp_path), tmp_path, **FEW)
 
 
 @pytest.mark.parametrize("name", [n if n == QUICK_LIT else pytest.param(n, marks=pytest.mark.slow) for n in LIT])

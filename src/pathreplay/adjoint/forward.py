@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative, forward_step, tangents
 from pathreplay.adjoint.null_branching import Branch, branch_term
-from pathreplay.transport.motion import path_moves
+from pathreplay.transport.motion import along_moving_paths, path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
@@ -34,6 +34,7 @@ def forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> t
     ray0 = path.at.ray
     valid = mi.Bool(trace.background_is_opaque) & path.active
     moves = path_moves(trace, start, path.at)
+    trace = along_moving_paths(trace, moves)
     branch = Branch.none(trace)
 
     while dr.hint(path.active, exclude=[trace, moves, lost], label="pathreplay: forward"):

@@ -28,7 +28,7 @@ from pathreplay.adjoint.record import Layout, record_type, room_for
 from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, record_path, sweep_path
 from pathreplay.samplers.pixel_samples import PixelSamples
 from pathreplay.samplers.sampler import Sampler
-from pathreplay.transport.motion import path_moves
+from pathreplay.transport.motion import along_moving_paths, path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
@@ -63,7 +63,8 @@ def pixel_sweep(
         sampler = numbers.first()
         ray0, _ = camera(sampler.clone(), mi.Bool(True))
         start = CameraStart(ray0, sampler, mi.Bool(True))
-        layout = Layout.of(trace, path_moves(trace, start, PathState.begin(trace, start).at))
+        moves = path_moves(trace, start, PathState.begin(trace, start).at)
+    trace, layout = along_moving_paths(trace, moves), Layout.of(trace, moves)
     records = dr.alloc_local(record_type(layout), paths * room)
     counts = dr.alloc_local(mi.UInt32, paths)  # number of records of each path
     ends = dr.alloc_local(mi.Spectrum, paths)  # radiance along the ray from the last recorded vertex

@@ -20,7 +20,7 @@ from pathreplay.adjoint.ray_jacobian import Recovery, has_smooth_lobes
 from pathreplay.adjoint.record import deepest
 from pathreplay.adjoint.replay_attached import replay_attached
 from pathreplay.errors import PathreplayError
-from pathreplay.transport.motion import path_moves
+from pathreplay.transport.motion import along_moving_paths, path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.step import repeat_step
@@ -56,7 +56,7 @@ def replay(
     else:
         if has_smooth_lobes(trace):
             _warn_of_smooth_lobes()
-        replay_attached(trace, start, path, δL, lost, recovery)
+        replay_attached(along_moving_paths(trace, moves), start, path, δL, lost, recovery)
     return moves
 
 

@@ -16,7 +16,7 @@ from pathreplay.adjoint.null_branching import branch_backward
 from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
 from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, record_path, sweep_path
 from pathreplay.errors import PathreplayError
-from pathreplay.transport.motion import path_moves
+from pathreplay.transport.motion import along_moving_paths, path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
@@ -44,6 +44,7 @@ def sweep(
     path = PathState.begin(trace, start, sustained=True)
     ray0 = path.at.ray
     moves = path_moves(trace, start, path.at)
+    trace = along_moving_paths(trace, moves)
     layout = Layout.of(trace, moves)
     records = dr.alloc_local(record_type(layout), room_for(trace))
     records, count, _, L, branch = record_path(trace, start.sampler, path, layout, records, mi.UInt32(0), lost)

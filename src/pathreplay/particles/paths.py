@@ -35,7 +35,7 @@ from pathreplay.particles.start import Emission, EmitterSamples, EmitterStart
 from pathreplay.platform.device import device_of
 from pathreplay.samplers.owen_sobol import OwenSobolSampler
 from pathreplay.samplers.sampler import Sampler
-from pathreplay.transport.motion import path_moves, weights_vary
+from pathreplay.transport.motion import along_moving_paths, path_moves, weights_vary
 from pathreplay.transport.path import PathState
 from pathreplay.transport.sensor import SensorLink
 from pathreplay.transport.vertex import Step, TraceConfig
@@ -113,6 +113,7 @@ def particle_tangent(
     i = dr.arange(mi.UInt32, particles.lanes)
     lanes, number = dr.opaque(mi.UInt32, particles.lanes), dr.opaque(mi.UInt32, particles.number)
     moves = particles.moves(trace)
+    trace = along_moving_paths(trace, moves)
 
     while dr.hint(i < number, exclude=[trace, particles, film, sums, lost, moves], label="pathreplay: particles"):
         start = particles.start(trace, i)
@@ -175,6 +176,7 @@ def particle_sweep(
         )
     trace = with_adjoint(trace, film, film.adjoint(grad_in) * film.scale(particles.number))
     moves = particles.moves(trace)
+    trace = along_moving_paths(trace, moves)
     layout = Layout.of(trace, moves)
     records = dr.alloc_local(record_type(layout), room_for(trace))
     i = dr.arange(mi.UInt32, particles.lanes)

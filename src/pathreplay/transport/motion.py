@@ -8,6 +8,7 @@ count only if objects of the traced scene have gradients, too.
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -89,6 +90,11 @@ def path_moves(trace: TraceConfig, start: Start, at: Arrival) -> bool:
     the BSDFs whose sampled directions are differentiated, and the emitters. Nothing is evaluated.
     """
     return _depends(trace, start, at, painted=True)
+
+
+def along_moving_paths(trace: TraceConfig, moves: bool) -> TraceConfig:
+    """Return the configuration of a gradient pass; ``moves`` is the result of `path_moves`."""
+    return replace(trace, balances_lobes=moves and bool(trace.traits.mirrors))
 
 
 def edges_move(trace: TraceConfig, start: Start, at: Arrival) -> bool:

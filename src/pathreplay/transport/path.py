@@ -43,10 +43,11 @@ class PathState:
         return PathState(start.choose(trace, active), mi.Spectrum(1), β_alive, mi.Float(1), mi.UInt32(0), active)
 
     def choose(self, trace: TraceConfig, sampler: Sampler) -> tuple[VertexSamples, SampledStep]:
-        """Draw the random numbers of this vertex, and sample its step from them."""
+        """Sample the step of this vertex. Return the random numbers with which the step was sampled, and the step."""
         u = VertexSamples.draw(sampler)
         β = self.β if self.β_alive is None else self.β_alive
-        return u, choose_step(trace, self.at, β, u, sampler, self.depth + 1 < trace.max_depth, self.active)
+        step = choose_step(trace, self.at, β, u, sampler, self.depth + 1 < trace.max_depth, self.active)
+        return step.u, step
 
     def leave(self) -> tuple[PathState, mi.Bool]:
         """Terminate paths whose ray leaves the scene.
@@ -72,6 +73,8 @@ class PathState:
         lasting = β if β_alive is None else β_alive
         η = self.η * step.eta
         rr_weight, survives = survival(lasting, η, self.depth, u.roulette, trace, step)
+        if step.u_weight is not None:
+            rr_weight *= step.u_weight
         active = step.active & survives & (dr.max(lasting) != 0)
         at = next_arrival(trace, self.at, step, active, self.depth == 0) if at is None else at
         β_alive = None if β_alive is None else β_alive * rr_weight

@@ -50,6 +50,8 @@ class Sampled:
     null: mi.Bool  # the continuation passes the surface unscattered
     eta: mi.Float
     active: mi.Bool  # there is a continuation
+    u: VertexSamples  # the random numbers that sampled the continuation
+    u_weight: mi.Float | None  # 1 / density of ``u``, or None: see `balanced`
 
 
 def choose(
@@ -66,6 +68,9 @@ def choose(
     at_surface = go_on & v.surface
     if v.inside is not None and trace.media.passes:
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
+    u_weight = None
+    if trace.balances_lobes:
+        u, u_weight = balanced(v, u, ctx, at_surface)
     f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(ctx, v.si, v.si.to_local(d), u.lobe, u.direction, at_surface)
     if ctx.mode == mi.TransportMode.Importance:
         f = smooth_adjoint(v, v.si.to_local(d), at_surface)
@@ -74,8 +79,29 @@ def choose(
     kept = SampledContinuation(
         v.si.to_world(sample.wo), sample.pdf, delta, dr.all(w == 0), sample.sampled_component, lit
     )
-    sampled = Sampled(f, pdf_light, w, kept, null, sample.eta, at_surface)
+    sampled = Sampled(f, pdf_light, w, kept, null, sample.eta, at_surface, u, u_weight)
     return sampled if v.inside is None else _in_medium(v, at, u, d, lit, go_on, sampled)
+
+
+def balanced(v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) -> tuple[VertexSamples, mi.Float]:
+    """Change the distribution of ``u.lobe``, so that rare lobes beside a delta reflection are selected more often.
+
+    Returns the new random numbers, and 1 / their density. At grazing angles, the transmittance T of glass is small and
+    proportional to the cosine c of the angle to the normal. On a path that moves, the derivative of c is proportional
+    to 1 / c, and so is that of T. If light is transmitted with the probability T, the second moment of the gradient is
+    therefore the integral of (1 / c)² / T over the projected area, ∫ 1 / c² dc, which diverges. The diffuse lobe of
+    ``plastic`` and total internal reflection have the same problem. If the other lobes of a BSDF are selected with a
+    probability 1 - R < 1/2 beside a delta reflection, the function changes this probability to 1/2. BSDFs select the
+    reflection if ``u.lobe`` is below R. Where this is not the case, the result is merely less efficient.
+    """
+    mixed = active & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.DeltaReflection)
+    mirrored, _ = v.bsdf.sample(ctx, v.si, mi.Float(0), u.direction, mixed)
+    rest = 1 - mirrored.pdf
+    mixed &= mi.has_flag(mirrored.sampled_type, mi.BSDFFlags.DeltaReflection) & (rest > 0) & (rest < 0.5)
+    rare = u.lobe >= 0.5
+    lobe = dr.select(rare, 1 - 2 * (1 - u.lobe) * rest, 2 * u.lobe * (1 - rest))
+    weight = 2 * dr.select(rare, rest, 1 - rest)
+    return replace(u, lobe=dr.select(mixed, lobe, u.lobe)), dr.select(mixed, weight, 1)
 
 
 def _in_medium(
@@ -96,7 +122,8 @@ def _in_medium(
     )
     f, pdf_light = dr.select(event, f, surface.f), dr.select(event, pdf_light, surface.pdf_light)
     w = dr.select(event, dr.select(pdf > 0, w, 0), dr.select(through, 1, surface.w))
-    return Sampled(f, pdf_light, w, kept, null, dr.select(v.surface, surface.eta, 1), bounce | null)
+    eta = dr.select(v.surface, surface.eta, 1)
+    return Sampled(f, pdf_light, w, kept, null, eta, bounce | null, surface.u, surface.u_weight)
 
 
 def _adjoint_weight(v: Vertex, sample: mi.BSDFSample3f, w: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:

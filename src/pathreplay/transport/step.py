@@ -63,7 +63,9 @@ def choose_step(
         seen = arrive.sees_lights(trace, at, v.si, active)
         lighting = Lighting(v.si, seen, link.light, dr.select(link.lit, w_light, 0), link.lit)
     ray_next, met = v.origin.spawn_ray(kept.d), v.met(go_on)
-    return SampledStep(e, w, ray_next, kept.pdf, met, kept, to.eta, to.null, to.active, medium, lighting)
+    return SampledStep(
+        e, w, ray_next, kept.pdf, met, kept, to.eta, to.null, to.active, to.u, to.u_weight, medium, lighting
+    )
 
 
 def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Step:

@@ -63,6 +63,9 @@ class TraceConfig:
     in a medium counts as a smooth lobe or, if the medium does not use emitter sampling, as a delta lobe."""
 
     # Choices of the caller.
+    balances_lobes: bool = False
+    """Whether lobes that are rarely selected beside a delta reflection are selected more often: see
+    `scatter.balanced`. True in gradient passes in which paths move."""
     skips_null: bool = False
     """Whether rays pass through null boundaries, as in the search for edges. If True, ``media`` must be None."""
     steady_frames: bool = False
@@ -248,7 +251,7 @@ class VertexRecord:
     kept: SampledContinuation
     go_on: mi.Bool  # there is a next vertex
     hit_next: mi.PreliminaryIntersection3f  # hit point of the next vertex
-    rr_weight: mi.Float  # 1 / survival probability
+    rr_weight: mi.Float  # 1 / survival probability, times `SampledStep.u_weight`
     β: mi.Spectrum  # throughput before the vertex
 
 
@@ -282,6 +285,8 @@ class SampledStep(Step):
     eta: mi.Float  # relative index of refraction across the continuation
     null: mi.Bool  # the continuation passes the surface unscattered
     active: mi.Bool  # there is a continuation
+    u: VertexSamples  # the random numbers that sampled the step
+    u_weight: mi.Float | None  # 1 / density of ``u``, see `scatter.balanced`; None if the density is 1 everywhere
     medium: mi.MediumPtr = None  # type: ignore[assignment]  # medium along the continuation; None in scenes without media
     lighting: Lighting = None  # type: ignore[assignment]  # on surfaces, if emitters have gradients; else None
 

@@ -298,9 +298,10 @@ def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
     return kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk) or (kind == mi.ShapeType.Sphere and not textured)
 
 
-def is_specular(bsdf: mi.BSDF) -> bool:
+def is_specular(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
     """Return whether a BSDF has a lobe of delta reflection or transmission. Transmission without scattering is none."""
-    return bool(bsdf.flags() & (mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission))
+    kinds, flags = (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission), bsdf.flags()
+    return mi.has_flag(flags, kinds[0]) | mi.has_flag(flags, kinds[1])
 
 
 def _delta_lobes(bsdf: mi.BSDF) -> int:
