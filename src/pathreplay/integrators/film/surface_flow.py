@@ -55,7 +55,7 @@ K_0 = 1e3
 STEEP, ENOUGH = 0.5, 0.02
 """STEEP is the cosine below which an angle is grazing. ENOUGH is the fraction of grazing angles near a node, and the
 variance of normals, at and above which the flow is kept in full."""
-SPECULAR = 24.0
+SPECULAR = 100.0
 """Weight A of specular surfaces that move."""
 GRAZING, NARROW = 0.1, 0.004
 """GRAZING is the cosine below which W levels off. NARROW is S times the square of the film's width in radians."""
