@@ -142,6 +142,9 @@ CELLS: dict[str, Write] = {
     "glass": moving(
         "ball.to_world", translate(1, 0.3, 0), depth=4, ball=ball({"type": "dielectric"}), floor=floor(PAINT), sky=SKY
     ),
+    "rough metal": moving(
+        "ball.to_world", translate(1, 0.3, 0), ball=ball({"type": "roughconductor"}), floor=floor(PAINT), sky=SKY
+    ),
     "in a fog": in_a_fog(),
     "in a beam": in_a_fog(lamp={"type": "point", "position": [1, 1, 2], "intensity": 4.0}),
     "before a cloud": on_a_floor(translate(1, 0.3, 0), sensor(), cloud=lambda: cloud("trilinear")),

@@ -13,13 +13,13 @@ velocity at a node of a grid is the mean
 
     v = Σ K W u / (K_0 + Σ K (W + S)),     W = A / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
 
-over nearby points, where r is their distance from the node on the film. Static points contribute with u = 0. The factor
-A is `SPECULAR` on moving surfaces that are specular (see `is_specular`), and 1 elsewhere. The Fresnel reflectance and
-the reflected direction on such surfaces change most at grazing angles. Between nodes, v is interpolated. The constant
-K_0 is the weight of the velocity zero. In a narrow field of view, u is large, and film positions that follow u cause
-more noise than fixed film positions. S is inversely proportional to the square of the field of view, so S reduces v in
-a narrow field of view. Finally, v is multiplied by a share that is 0 near static lights (see `lights`) and where moving
-surfaces have no silhouettes.
+over nearby points, where r is their distance from the node on the film. Static points contribute with u = 0. The
+radiance that leaves a shiny surface, which has a specular or glossy lobe, changes with the normal much more than that
+of a diffuse surface, most of all at grazing angles. If a shiny surface moves, A is therefore `SHINY` on all shiny
+surfaces. Elsewhere, A is 1. Between nodes, v is interpolated. The constant K_0 is the weight of the velocity zero. In a
+narrow field of view, u is large, and film positions that follow u cause more noise than fixed film positions. S is
+inversely proportional to the square of the field of view, so S reduces v in a narrow field of view. Finally, v is
+multiplied by a share that is 0 near static lights (see `lights`) and where moving surfaces have no silhouettes.
 
 The derivative of the image does not depend on the choice of v (see `camera_flow`). With the choice above, the interior
 and boundary terms have to differentiate little motion near silhouettes.
@@ -45,7 +45,7 @@ from pathreplay.integrators.film.sample import (
 )
 from pathreplay.platform import compat
 from pathreplay.transport.facts.nodes import with_gradients
-from pathreplay.transport.facts.traits import is_specular
+from pathreplay.transport.facts.traits import is_shiny
 from pathreplay.transport.meet import meet
 from pathreplay.transport.motion import have_gradients, may_move, shapes_with_gradients
 from pathreplay.transport.vertex import TraceConfig
@@ -55,8 +55,8 @@ K_0 = 1e3
 STEEP, ENOUGH = 0.5, 0.02
 """STEEP is the cosine below which an angle is grazing. ENOUGH is the fraction of grazing angles near a node, and the
 variance of normals, at and above which the flow is kept in full."""
-SPECULAR = 100.0
-"""Weight A of specular surfaces that move."""
+SHINY = 100.0
+"""Weight A of surfaces with a specular or glossy lobe, if one of them moves."""
 GRAZING, NARROW = 0.1, 0.004
 """GRAZING is the cosine below which W levels off. NARROW is S times the square of the film's width in radians."""
 
@@ -88,7 +88,8 @@ class SurfaceFlow:
             derivatives = ray_derivatives(sensor, sample)
             cos, step = dr.dot(dr.detach(si.n), ray.d), derivatives[0][0] + t * derivatives[1][0]
             moves = visible & may_move(trace, hit)
-            A = dr.select(moves & is_specular(si.bsdf(ray)), SPECULAR, mi.Float(1))
+            shiny = visible & is_shiny(si.bsdf(ray))
+            A = dr.select(shiny & dr.any(shiny & moves), SHINY, mi.Float(1))
             grazing, S = A * dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / dr.squared_norm(step)
             W = dr.select(visible, grazing + S, 0)
             u = film_velocity((si.p - dr.detach(si.p)) / t, derivatives, dr.rcp(t)) * grazing / (grazing + S)

@@ -298,10 +298,15 @@ def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
     return kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk) or (kind == mi.ShapeType.Sphere and not textured)
 
 
-def is_specular(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
+def is_specular(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF has a lobe of delta reflection or transmission. Transmission without scattering is none."""
-    kinds, flags = (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission), bsdf.flags()
-    return mi.has_flag(flags, kinds[0]) | mi.has_flag(flags, kinds[1])
+    return bool(bsdf.flags() & (mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission))
+
+
+def is_shiny(bsdf: mi.BSDFPtr) -> mi.Bool:
+    """Return the lanes whose BSDF has a glossy lobe, or a lobe of delta reflection or transmission."""
+    kinds = mi.BSDFFlags.Glossy | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
+    return (bsdf.flags() & int(kinds)) != 0
 
 
 def _delta_lobes(bsdf: mi.BSDF) -> int:
