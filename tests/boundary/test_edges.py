@@ -336,7 +336,7 @@ def test_a_search_in_parts_finds_as_much(name: str, monkeypatch: pytest.MonkeyPa
     """Memory is proportional to the size of a part. Neither mean nor noise of a gradient depends on it."""
     bench = Bench(scenes.BY_NAME[name])
     bench.weigh(scenes.weights())
-    seeds, spp = range(12), 5
+    seeds, spp = range(8), 5
     whole = np.array([bench.backward(ours(bench), seed, spp) for seed in seeds])
     searched, importances = [], SecondarySearch._importances
 
