@@ -208,10 +208,8 @@ def test_noise_of_a_fog_that_moves_falls(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_noise_of_a_rough_metal_falls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The floor around it is diffuse, and may slide."""
-    above, metal = (
-        sensor(place=T().look_at([0, 1, 3.2], [0, -0.1, 0], [0, 1, 0])),
-        {"type": "roughconductor", "alpha": 0.15},
-    )
+    above = sensor(place=T().look_at([0, 1, 3.2], [0, -0.1, 0], [0, 1, 0]))
+    metal = {"type": "roughconductor", "alpha": 0.15}
     write = moving("ball.to_world", translate(1, 0, 0), above, ball=ball(metal), floor=floor(PAINT), sky=SKY)
     objective = loaded(write(tmp_path), tmp_path)
     ours, spread = mi.load_dict({"type": "pathreplay", "max_depth": 3}), []

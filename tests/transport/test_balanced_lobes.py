@@ -12,9 +12,10 @@ import pytest
 from pathreplay.integrators.lifetimes import careful
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.transport.meet import meet
+from pathreplay.transport.motion import along_moving_paths
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
-from pathreplay.transport.vertex import SampledStep, TraceConfig
+from pathreplay.transport.vertex import SampledStep
 
 LANES = 2**16
 KINDS: dict[str, Any] = {
@@ -32,19 +33,21 @@ KINDS: dict[str, Any] = {
 }
 
 
-def sampled(bsdf: dict[str, Any], cos: float, balances: bool) -> SampledStep:
-    """Steps at the first vertex of paths that meet a square with this cosine."""
+def sampled(bsdf: dict[str, Any], cos: float, balances: bool) -> tuple[SampledStep, np.ndarray]:
+    """Steps at the first vertex of paths that meet a square with this cosine, and the throughputs after it."""
     scene = mi.load_dict({"type": "scene", "square": {"type": "rectangle", "bsdf": bsdf}})
     trace = mi.load_dict({"type": "pathreplay"})._trace_config(scene, None)
-    trace = TraceConfig(**{**vars(trace), "balances_lobes": balances})
+    trace = along_moving_paths(trace, balances)
     d = mi.Vector3f((1 - cos * cos) ** 0.5, 0, -cos)
     ray = mi.Ray3f(-0.5 * d + dr.zeros(mi.Point3f, LANES), d)
     start = CameraStart(ray, CounterSampler.of(dr.arange(mi.UInt32, LANES)), mi.Bool(True))
     with careful(), dr.suspend_grad():
         assert dr.all(meet(trace, ray, mi.Bool(True)).is_valid())
-        _, step = PathState.begin(trace, start).choose(trace, start.sampler)
-        dr.eval(step)
-    return step
+        path = PathState.begin(trace, start)
+        u, step = path.choose(trace, start.sampler)
+        β = dr.mean(path.advance(trace, u, step)[0].β)
+        dr.eval(step, β)
+    return step, np.array(β)
 
 
 def passed(step: SampledStep) -> np.ndarray:
@@ -57,10 +60,7 @@ def test_the_mean_is_unchanged(kind: str, cos: float) -> None:
     """Light that is reflected and light that is not: (mean, standard error) of each weight."""
     found = []
     for balances in (True, False):
-        step = sampled(KINDS[kind], cos, balances)
-        w = np.array(dr.mean(step.w))
-        if step.u_weight is not None:
-            w = w * np.array(step.u_weight)
+        step, w = sampled(KINDS[kind], cos, balances)
         mirrored = np.array(step.kept.delta) & ~passed(step)
         found.append([(x.mean(), x.std() / LANES**0.5) for x in (w * mirrored, w * ~mirrored)])
     for (a, da), (b, db) in zip(*found, strict=True):
@@ -69,10 +69,24 @@ def test_the_mean_is_unchanged(kind: str, cos: float) -> None:
 
 @pytest.mark.parametrize("cos", [0.05, 1e-3, 1e-5])
 def test_rare_transmission_is_sampled_every_second_time(cos: float) -> None:
-    step = sampled(KINDS["glass"], cos, True)
+    step, _ = sampled(KINDS["glass"], cos, True)
     assert passed(step).mean() == pytest.approx(0.5, abs=0.02)
-    assert passed(sampled(KINDS["glass"], cos, False)).mean() < 0.3
+    assert passed(sampled(KINDS["glass"], cos, False)[0]).mean() < 0.3
 
 
 def test_common_lobes_are_sampled_as_the_bsdf_does() -> None:
-    assert np.all(np.array(sampled(KINDS["glass"], 0.8, True).u_weight) == 1)
+    assert np.all(np.array(sampled(KINDS["glass"], 0.8, True)[0].u_weight) == 1)
+
+
+def test_russian_roulette_does_not_end_them() -> None:
+    """A throughput that is small because a rare lobe was sampled often says nothing about the radiance behind it."""
+    scene = mi.load_dict({"type": "scene", "square": {"type": "rectangle", "bsdf": KINDS["glass"]}})
+    trace = along_moving_paths(mi.load_dict({"type": "pathreplay", "rr_depth": 1})._trace_config(scene, None), True)
+    d = mi.Vector3f(1, 0, -1e-3)
+    ray = mi.Ray3f(-0.5 * dr.normalize(d) + dr.zeros(mi.Point3f, LANES), dr.normalize(d))
+    start = CameraStart(ray, CounterSampler.of(dr.arange(mi.UInt32, LANES)), mi.Bool(True))
+    with careful(), dr.suspend_grad():
+        path = PathState.begin(trace, start, sustained=True)
+        onward = path.advance(trace, *path.choose(trace, start.sampler))[0]
+    β, alive = np.array(dr.mean(onward.β)), np.array(dr.mean(onward.β_alive))
+    assert β.min() < 0.05 and alive.min() > 0.3

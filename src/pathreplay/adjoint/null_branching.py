@@ -74,7 +74,7 @@ def branch_term(trace: TraceConfig, branch: Branch, sampler: Sampler, ray: mi.Ra
     camera ``ray``. The term is differentiable in the coefficients of the medium. The caller must resume gradients
     (`dr.resume_grad`).
     """
-    onward = replace(trace, branching=None)
+    onward = replace(trace, branching=None, balances_lobes=False)
     active = branch.mass > 0
     with dr.suspend_grad():
         ray, hit = mi.Ray3f(branch.p, branch.d, ray.time, ray.wavelengths), dr.zeros(mi.PreliminaryIntersection3f)

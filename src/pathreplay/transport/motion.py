@@ -93,8 +93,12 @@ def path_moves(trace: TraceConfig, start: Start, at: Arrival) -> bool:
 
 
 def along_moving_paths(trace: TraceConfig, moves: bool) -> TraceConfig:
-    """Return the configuration of a gradient pass; ``moves`` is the result of `path_moves`."""
-    return replace(trace, balances_lobes=moves and bool(trace.traits.mirrors))
+    """Return the configuration with `TraceConfig.balances_lobes` set, if paths move and some BSDF has such lobes.
+
+    ``moves`` is the result of `path_moves`.
+    """
+    mirrors = (bsdf for bsdf in trace.traits.mirrors if mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection))
+    return replace(trace, balances_lobes=moves and any(bsdf.component_count() > 1 for bsdf in mirrors))
 
 
 def edges_move(trace: TraceConfig, start: Start, at: Arrival) -> bool:

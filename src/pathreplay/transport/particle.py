@@ -70,8 +70,21 @@ def choose_step(
     kept.lit = lit
     splat = Splat(dr.select(lit, c, 0), to.s)
     e, ray_next, met = _weighted(link, splat, at, lit), v.origin.spawn_ray(kept.d), v.met(go_on)
-    eta, null, used, u_weight = mi.Float(1), sampled.null, sampled.u, sampled.u_weight
-    return SampledStep(e, w, ray_next, kept.pdf, met, kept, eta, null, going, used, u_weight, medium, splat=splat)
+    return SampledStep(
+        e,
+        w,
+        ray_next,
+        kept.pdf,
+        met,
+        kept,
+        mi.Float(1),
+        sampled.null,
+        going,
+        u=sampled.u,
+        u_weight=sampled.u_weight,
+        medium=medium,
+        splat=splat,
+    )
 
 
 def repeat_step(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Step:

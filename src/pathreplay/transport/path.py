@@ -73,11 +73,11 @@ class PathState:
         lasting = β if β_alive is None else β_alive
         η = self.η * step.eta
         rr_weight, survives = survival(lasting, η, self.depth, u.roulette, trace, step)
+        β_alive = None if β_alive is None else β_alive * rr_weight  # without ``u_weight``: rare lobes would soon end
         if step.u_weight is not None:
             rr_weight *= step.u_weight
         active = step.active & survives & (dr.max(lasting) != 0)
         at = next_arrival(trace, self.at, step, active, self.depth == 0) if at is None else at
-        β_alive = None if β_alive is None else β_alive * rr_weight
         onward = PathState(at, β * rr_weight, β_alive, η, self.passed(trace, step), active)
         return onward, VertexRecord(self.at, u, step.kept, active, at.hit, rr_weight, self.β)
 

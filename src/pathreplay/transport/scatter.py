@@ -86,13 +86,15 @@ def choose(
 def balanced(v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) -> tuple[VertexSamples, mi.Float]:
     """Change the distribution of ``u.lobe``, so that rare lobes beside a delta reflection are selected more often.
 
-    Returns the new random numbers, and 1 / their density. At grazing angles, the transmittance T of glass is small and
-    proportional to the cosine c of the angle to the normal. On a path that moves, the derivative of c is proportional
-    to 1 / c, and so is that of T. If light is transmitted with the probability T, the second moment of the gradient is
-    therefore the integral of (1 / c)² / T over the projected area, ∫ 1 / c² dc, which diverges. The diffuse lobe of
-    ``plastic`` and total internal reflection have the same problem. If the other lobes of a BSDF are selected with a
-    probability 1 - R < 1/2 beside a delta reflection, the function changes this probability to 1/2. BSDFs select the
-    reflection if ``u.lobe`` is below R. Where this is not the case, the result is merely less efficient.
+    If the other lobes of a BSDF are selected with a probability 1 - R < 1/2 beside a delta reflection, the function
+    changes this probability to 1/2. Returns the new random numbers, and 1 / their density.
+
+    At grazing angles, the transmittance T of glass is small and proportional to the cosine c of the angle to the
+    normal. On a path that moves, the derivative of c is proportional to 1 / c, and so is that of T. If light is
+    transmitted with the probability T, the second moment of the gradient is therefore the integral of (1 / c)² / T over
+    the projected area, ∫ 1 / c² dc, which diverges. The same is true of the diffuse lobe of ``plastic``, and of
+    transmission near the critical angle. BSDFs select the reflection if ``u.lobe`` is below R. Where this is not the
+    case, the result is less efficient, with weights of at most 2.
     """
     mixed = active & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.DeltaReflection)
     mirrored, _ = v.bsdf.sample(ctx, v.si, mi.Float(0), u.direction, mixed)
@@ -100,6 +102,7 @@ def balanced(v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) 
     mixed &= mi.has_flag(mirrored.sampled_type, mi.BSDFFlags.DeltaReflection) & (rest > 0) & (rest < 0.5)
     rare = u.lobe >= 0.5
     lobe = dr.select(rare, 1 - 2 * (1 - u.lobe) * rest, 2 * u.lobe * (1 - rest))
+    lobe = dr.minimum(lobe, dr.one_minus_epsilon(mi.Float))
     weight = 2 * dr.select(rare, rest, 1 - rest)
     return replace(u, lobe=dr.select(mixed, lobe, u.lobe)), dr.select(mixed, weight, 1)
 

@@ -270,7 +270,8 @@ class Step:
     # On camera paths: emission (MIS weighted) plus the next-event estimate. On light paths: the contribution to the
     # film, times the adjoint of the image.
     e: mi.Spectrum
-    w: mi.Spectrum  # f/p of a smooth lobe, or the weight of a delta lobe, without Russian roulette
+    # f/p of a smooth lobe, or the weight of a delta lobe, without Russian roulette and `SampledStep.u_weight`.
+    w: mi.Spectrum
     ray_next: mi.Ray3f
     pdf: mi.Float  # density of the continuation, for the MIS weight at the next vertex
     splat: Splat | None = field(default=None, kw_only=True)  # contribution to the film; None on camera paths
@@ -286,7 +287,7 @@ class SampledStep(Step):
     null: mi.Bool  # the continuation passes the surface unscattered
     active: mi.Bool  # there is a continuation
     u: VertexSamples  # the random numbers that sampled the step
-    u_weight: mi.Float | None  # 1 / density of ``u``, see `scatter.balanced`; None if the density is 1 everywhere
+    u_weight: mi.Float | None  # 1 / density of ``u``, see `scatter.balanced`; None unless `balances_lobes`
     medium: mi.MediumPtr = None  # type: ignore[assignment]  # medium along the continuation; None in scenes without media
     lighting: Lighting = None  # type: ignore[assignment]  # on surfaces, if emitters have gradients; else None
 

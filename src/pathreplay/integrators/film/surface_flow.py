@@ -11,7 +11,7 @@ the hit point of a ray slides over the surface with a speed proportional to u / 
 normal and ray. This speed is unbounded at silhouettes. Points at grazing angles therefore have the largest weights. The
 velocity at a node of a grid is the mean
 
-    v = Σ K W u / (K_0 + Σ K (W + S)),     W = A / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
+    v = Σ K A W u / (K_0 + Σ K A (W + S)),   W = 1 / (cos² + GRAZING²),   K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
 
 over nearby points, where r is their distance from the node on the film. Static points contribute with u = 0. The
 radiance that leaves a shiny surface, which has a specular or glossy lobe, changes with the normal much more than that
@@ -88,10 +88,9 @@ class SurfaceFlow:
             derivatives = ray_derivatives(sensor, sample)
             cos, step = dr.dot(dr.detach(si.n), ray.d), derivatives[0][0] + t * derivatives[1][0]
             moves = visible & may_move(trace, hit)
-            shiny = visible & is_shiny(si.bsdf(ray))
-            A = dr.select(shiny & dr.any(shiny & moves), SHINY, mi.Float(1))
-            grazing, S = A * dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / dr.squared_norm(step)
-            W = dr.select(visible, grazing + S, 0)
+            A = _material_weight(trace, si, moves, visible)
+            grazing, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / dr.squared_norm(step)
+            W = dr.select(visible, A * (grazing + S), 0)
             u = film_velocity((si.p - dr.detach(si.p)) / t, derivatives, dr.rcp(t)) * grazing / (grazing + S)
             dr.eval(u, W, moves)  # evaluate once: every node gathers from these arrays
 
@@ -130,6 +129,14 @@ class SurfaceFlow:
     def carry_tangents(self) -> None:
         with dr.resume_grad():
             tangents(self.nodes)
+
+
+def _material_weight(trace: TraceConfig, si: mi.SurfaceInteraction3f, moves: mi.Bool, visible: mi.Bool) -> mi.Float:
+    """Return the weight A of each point: see the module."""
+    if not (trace.traits.mirrors or trace.traits.narrow):
+        return mi.Float(1)
+    shiny = visible & is_shiny(si.bsdf())
+    return dr.select(shiny & dr.any(shiny & moves), SHINY, mi.Float(1))
 
 
 def _near_silhouettes(moves: mi.Bool, n: mi.Vector3f, cos: mi.Float) -> mi.Float:
