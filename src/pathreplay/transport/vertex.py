@@ -270,8 +270,7 @@ class Step:
     # On camera paths: emission (MIS weighted) plus the next-event estimate. On light paths: the contribution to the
     # film, times the adjoint of the image.
     e: mi.Spectrum
-    # f/p of a smooth lobe, or the weight of a delta lobe, without Russian roulette and `SampledStep.u_weight`.
-    w: mi.Spectrum
+    w: mi.Spectrum  # f/p of a smooth lobe, or the weight of a delta lobe, without Russian roulette
     ray_next: mi.Ray3f
     pdf: mi.Float  # density of the continuation, for the MIS weight at the next vertex
     splat: Splat | None = field(default=None, kw_only=True)  # contribution to the film; None on camera paths
