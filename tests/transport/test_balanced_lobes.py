@@ -33,21 +33,23 @@ KINDS: dict[str, Any] = {
 }
 
 
-def sampled(bsdf: dict[str, Any], cos: float, balances: bool) -> tuple[SampledStep, np.ndarray]:
-    """Steps at the first vertex of paths that meet a square with this cosine, and the throughputs after it."""
+def sampled(
+    bsdf: dict[str, Any], cos: float, balances: bool, sustained: bool = False, **properties: Any
+) -> tuple[SampledStep, PathState]:
+    """Steps at the first vertex of paths that meet a square with this cosine, and the paths after it."""
     scene = mi.load_dict({"type": "scene", "square": {"type": "rectangle", "bsdf": bsdf}})
-    trace = mi.load_dict({"type": "pathreplay"})._trace_config(scene, None)
+    trace = mi.load_dict({"type": "pathreplay", **properties})._trace_config(scene, None)
     trace = along_moving_paths(trace, balances)
     d = mi.Vector3f((1 - cos * cos) ** 0.5, 0, -cos)
     ray = mi.Ray3f(-0.5 * d + dr.zeros(mi.Point3f, LANES), d)
     start = CameraStart(ray, CounterSampler.of(dr.arange(mi.UInt32, LANES)), mi.Bool(True))
     with careful(), dr.suspend_grad():
         assert dr.all(meet(trace, ray, mi.Bool(True)).is_valid())
-        path = PathState.begin(trace, start)
+        path = PathState.begin(trace, start, sustained)
         u, step = path.choose(trace, start.sampler)
-        β = dr.mean(path.advance(trace, u, step)[0].β)
-        dr.eval(step, β)
-    return step, np.array(β)
+        onward = path.advance(trace, u, step)[0]
+        dr.eval(step, onward)
+    return step, onward
 
 
 def passed(step: SampledStep) -> np.ndarray:
@@ -60,7 +62,8 @@ def test_the_mean_is_unchanged(kind: str, cos: float) -> None:
     """Light that is reflected and light that is not: (mean, standard error) of each weight."""
     found = []
     for balances in (True, False):
-        step, w = sampled(KINDS[kind], cos, balances)
+        step, onward = sampled(KINDS[kind], cos, balances)
+        w = np.array(dr.mean(onward.β))
         mirrored = np.array(step.kept.delta) & ~passed(step)
         found.append([(x.mean(), x.std() / LANES**0.5) for x in (w * mirrored, w * ~mirrored)])
     for (a, da), (b, db) in zip(*found, strict=True):
@@ -80,13 +83,6 @@ def test_common_lobes_are_sampled_as_the_bsdf_does() -> None:
 
 def test_russian_roulette_does_not_end_them() -> None:
     """A throughput that is small because a rare lobe was sampled often says nothing about the radiance behind it."""
-    scene = mi.load_dict({"type": "scene", "square": {"type": "rectangle", "bsdf": KINDS["glass"]}})
-    trace = along_moving_paths(mi.load_dict({"type": "pathreplay", "rr_depth": 1})._trace_config(scene, None), True)
-    d = mi.Vector3f(1, 0, -1e-3)
-    ray = mi.Ray3f(-0.5 * dr.normalize(d) + dr.zeros(mi.Point3f, LANES), dr.normalize(d))
-    start = CameraStart(ray, CounterSampler.of(dr.arange(mi.UInt32, LANES)), mi.Bool(True))
-    with careful(), dr.suspend_grad():
-        path = PathState.begin(trace, start, sustained=True)
-        onward = path.advance(trace, *path.choose(trace, start.sampler))[0]
+    _, onward = sampled(KINDS["glass"], 1e-3, True, sustained=True, rr_depth=1)
     β, alive = np.array(dr.mean(onward.β)), np.array(dr.mean(onward.β_alive))
     assert β.min() < 0.05 and alive.min() > 0.3

@@ -88,11 +88,13 @@ class SurfaceFlow:
             derivatives = ray_derivatives(sensor, sample)
             cos, step = dr.dot(dr.detach(si.n), ray.d), derivatives[0][0] + t * derivatives[1][0]
             moves = visible & may_move(trace, hit)
-            A = _material_weight(trace, si, moves, visible)
             grazing, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / dr.squared_norm(step)
-            W = dr.select(visible, A * (grazing + S), 0)
+            W = dr.select(visible, grazing + S, 0)
+            shiny = visible & is_shiny(si.bsdf())
             u = film_velocity((si.p - dr.detach(si.p)) / t, derivatives, dr.rcp(t)) * grazing / (grazing + S)
-            dr.eval(u, W, moves)  # evaluate once: every node gathers from these arrays
+            dr.eval(u, W, moves, shiny)  # evaluate once: every node gathers from these arrays
+            W *= dr.select(shiny & dr.any(shiny & moves), SHINY, mi.Float(1))  # the factor A
+            dr.eval(W)
 
             share = _near_silhouettes(moves, mi.Vector3f(dr.detach(si.n)), cos) * _away_from_lights(trace, sensor)
             sums = NodeSums.of(W)
@@ -129,14 +131,6 @@ class SurfaceFlow:
     def carry_tangents(self) -> None:
         with dr.resume_grad():
             tangents(self.nodes)
-
-
-def _material_weight(trace: TraceConfig, si: mi.SurfaceInteraction3f, moves: mi.Bool, visible: mi.Bool) -> mi.Float:
-    """Return the weight A of each point: see the module."""
-    if not (trace.traits.mirrors or trace.traits.narrow):
-        return mi.Float(1)
-    shiny = visible & is_shiny(si.bsdf())
-    return dr.select(shiny & dr.any(shiny & moves), SHINY, mi.Float(1))
 
 
 def _near_silhouettes(moves: mi.Bool, n: mi.Vector3f, cos: mi.Float) -> mi.Float:
