@@ -19,7 +19,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.owned_arrays import owned, with_space
-from pathreplay.transport.vertex import VertexRecord
+from pathreplay.transport.vertex import VertexRecord, channel_mean
 from pathreplay.transport.volume.media import interaction, majorant, span
 
 # CELLS is the number of cells along each axis of space. SIDES is the number of cells along each side of the octahedral
@@ -116,7 +116,7 @@ class BaselineStats:
 
     def _add(self, cell: mi.UInt32, L: mi.Spectrum, weight: mi.Float, active: mi.Bool) -> None:
         active = active & dr.all(dr.isfinite(L))
-        x, y, z = L if _channels() == 3 else 3 * [dr.mean(L)]
+        x, y, z = L if _channels() == 3 else 3 * [channel_mean(L)]
         dr.scatter_add(self.sums, mi.Vector4f(x, y, z, 1) * weight, cell, active)
 
     def tally(self, nulls: mi.Float) -> None:
@@ -142,7 +142,7 @@ class Baseline:
         mei, σ_t = dr.detach(mei), dr.detach(σ_t)
         cell = self.cells.index(mei.p, -mei.wi)
         X, Y = dr.gather(mi.Vector4f, self.known, cell, active), dr.gather(mi.Vector4f, self.known, cell + 1, active)
-        p = dr.select(σ_bar > 0, dr.clip(dr.mean(σ_t) / σ_bar, 0, 1), 0)
+        p = dr.select(σ_bar > 0, dr.clip(channel_mean(σ_t) / σ_bar, 0, 1), 0)
         b = X + p * (Y - X)
         return mi.Spectrum(b.x, b.y, b.z) if _channels() == 3 else mi.Spectrum(b.x)
 

@@ -26,6 +26,23 @@ def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool
 
 
 @dr.syntax
+def two_radiances(
+    trace: TraceConfig, sampler: Sampler, first: PathState, second: PathState
+) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """Return the `path_radiance` of two paths that use the same random numbers. The kernel contains one loop for both.
+
+    The ``sampler`` is not advanced.
+    """
+    a, b, n = mi.Spectrum(0), mi.Spectrum(0), mi.UInt32(0)
+    either = first.active | second.active
+    while dr.hint(either & (n < 2), exclude=[trace, sampler, first, second], label="pathreplay: two paths"):
+        path = dr.select(n == 0, first, second)
+        a, b = b, path_radiance(trace, sampler.clone(), path)[0]
+        n += 1
+    return a, b
+
+
+@dr.syntax
 def path_radiance(trace: TraceConfig, sampler: Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
     """Continue a path from its present state; return the radiance along the path, and ``valid`` (see `primal`).
 

@@ -29,6 +29,7 @@ from pathreplay.boundary.crofton import Bracket
 from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
+from pathreplay.transport.vertex import channel_mean
 
 UNIFORM = 0.25
 """Fraction of arcs through uniformly sampled directions. BSDF samples are rare in weak lobes and below the horizon."""
@@ -87,7 +88,7 @@ class Arc:
     @property
     def light(self) -> mi.Float:
         """The throughput of the sampled direction, divided by its density."""
-        return dr.select(self.active, dr.mean(dr.abs(self.observer.selected.β * self.f)) / self.p, 0)
+        return dr.select(self.active, channel_mean(dr.abs(self.observer.selected.β * self.f)) / self.p, 0)
 
     def per_length(self, bracket: Bracket, pdf: mi.Float, active: mi.Bool) -> mi.Float:
         """Return the number of crossings of a bracket times π/2 / (l p(c)): see `Bracket.per_length` and `weight`."""

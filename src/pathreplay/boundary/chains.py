@@ -174,14 +174,28 @@ class ChainSplit:
     shadows: tuple[ShadowTest, ShadowTest] | None = None  # None if no vertex is tested: see `tests_shadows`
 
 
-@dr.syntax
 def split_chains(trace: TraceConfig, paths: tuple[PathState, PathState], key: mi.UInt32) -> ChainSplit:
     """Find the first vertex at which two chains with equal random numbers hit different surfaces."""
-    (a, b), start = paths, mi.UInt32(paths[0].depth)
+    a, b = paths
     active = a.active & b.active
-    sampler_a, sampler_b = CounterSampler.at_vertex(key, a.depth), CounterSampler.at_vertex(key, b.depth)
     parted = active & _probe_vertex(trace, a, key, active).differs(_probe_vertex(trace, b, key, active))
-    go_on = active & ~parted
+    if trace.traits.mirrors:
+        a, b, parted = _split_later(trace, a, b, parted, key)
+    split = ChainSplit(a.depth, a.at, b.at, a.β, parted)
+    if tests_shadows(trace):
+        shadow_a, shadow_b = (_shadow_test(trace, at, key, split.k, active & ~parted) for at in (a.at, b.at))
+        split.shadows = shadow_a, shadow_b
+        split.parted |= shadow_a.dark != shadow_b.dark
+    return split
+
+
+@dr.syntax
+def _split_later(
+    trace: TraceConfig, a: PathState, b: PathState, parted: mi.Bool, key: mi.UInt32
+) -> tuple[PathState, PathState, mi.Bool]:
+    """Advance two chains that are not ``parted`` until they diverge or end; return both, and where they diverge."""
+    start, go_on = mi.UInt32(a.depth), a.active & b.active & ~parted
+    sampler_a, sampler_b = CounterSampler.at_vertex(key, a.depth), CounterSampler.at_vertex(key, b.depth)
     while dr.hint(go_on, exclude=[trace], label="pathreplay: split"):
         if dr.hint(tests_shadows(trace), mode="scalar"):
             dark_a, dark_b = (_shadow_test(trace, path.at, key, path.depth, go_on).dark for path in (a, b))
@@ -198,15 +212,9 @@ def split_chains(trace: TraceConfig, paths: tuple[PathState, PathState], key: mi
         a, b = dr.select(go_on, next_a, a), dr.select(go_on, next_b, b)
         parted |= go_on & _probe_vertex(trace, a, key, go_on).differs(_probe_vertex(trace, b, key, go_on))
         go_on &= ~parted
-    split = ChainSplit(a.depth, a.at, b.at, a.β, parted)
-    if dr.hint(tests_shadows(trace), mode="scalar"):
-        shadow_a, shadow_b = (_shadow_test(trace, at, key, split.k, active & ~parted) for at in (a.at, b.at))
-        split.shadows = shadow_a, shadow_b
-        split.parted |= shadow_a.dark != shadow_b.dark
-    return split
+    return a, b, parted
 
 
-@dr.syntax
 def record_chain(
     trace: TraceConfig, s: mi.Point2f, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, at: mi.Ray3f, active: mi.Bool
 ) -> tuple[EdgePath, mi.Bool]:
@@ -216,6 +224,18 @@ def record_chain(
     the chain passes all ``k`` vertices.
     """
     layout = Layout.of(trace, True)
+    if not trace.traits.mirrors:
+        return EdgePath(s, key, mi.UInt32(0), at, layout, None), active
+    records, count = _records_of_chain(trace, layout, ray, key, k, active)
+    reached = active & (count == k + 1)
+    return EdgePath(s, key, dr.select(reached, k, 0), at, layout, records), reached
+
+
+@dr.syntax
+def _records_of_chain(
+    trace: TraceConfig, layout: Layout, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, active: mi.Bool
+) -> tuple[dr.Local[object], mi.UInt32]:
+    """Record at most k + 1 vertices of a chain; return the records and their number."""
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
     sampler = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
@@ -227,8 +247,7 @@ def record_chain(
         records[count] = record(layout, v)
         path = onward
         count += 1
-    reached = active & (count == k + 1)
-    return EdgePath(s, key, dr.select(reached, k, 0), at, layout, records), reached
+    return records, count
 
 
 @dr.syntax

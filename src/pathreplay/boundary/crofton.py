@@ -39,9 +39,11 @@ CRACK_BISECTIONS = 8
 """An end that stays fixed in this many successive bisections suggests a crack. At a true edge, this happens with a
 probability of 2^-7."""
 PARTS = 3
-"""Number of bisections with which `middle_fraction` locates each end of the part that differs from the ends."""
+"""Number of probes with which `MiddlePart` locates each of its ends."""
 MIN_FRACTION = 9 / 32
-"""Fraction below which `middle_weight` is constant. It is halfway between two results of `middle_fraction`."""
+"""Fraction below which `middle_weight` is constant. It is halfway between two values of `MiddlePart.fraction`."""
+ENDS, ENDS_AND_MIDDLE, END = 2, 2 + 2 * PARTS, 2 + 2 * PARTS + BISECTIONS
+"""Numbers of probes after which the stages of `bisect` end."""
 BEYOND = 1.5
 """Distance beyond the fixed end at which a suspected crack is probed, in lengths of the final interval. In the square
 of an emitter this distance is less than `emitters.BORDER`."""
@@ -189,9 +191,21 @@ def probe_positions(length: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
     return -0.5 * length, 0.5 * length, mi.Float(0)
 
 
+@dr.syntax
+def survey(probe: Probe, length: mi.Float, active: mi.Bool) -> Survey:
+    """Probe a segment at `probe_positions`, in a loop, so that the kernel contains the probe only once."""
+    a, b, c = VisibilityProbe.of(), VisibilityProbe.of(), VisibilityProbe.of()
+    n, (first, second, third) = mi.UInt32(0), probe_positions(length)
+    while dr.hint(active & (n < 3), exclude=[probe], label="pathreplay: survey of a segment"):
+        t = dr.select(n == 0, first, dr.select(n == 1, second, third))
+        a, b, c = b, c, probe(t, mi.Bool(True))
+        n += 1
+    return Survey.of([a, b, c], active)
+
+
 def detect(probe: Probe, length: mi.Float, active: mi.Bool) -> mi.Float:
     """Probe a segment, and return `Survey.presence`: 0 if no edge is detected."""
-    return Survey.of([probe(t, active) for t in probe_positions(length)], active).presence
+    return survey(probe, length, active).presence
 
 
 def middle_weight(m: mi.Float) -> mi.Float:
@@ -208,29 +222,32 @@ def middle_weight(m: mi.Float) -> mi.Float:
     return dr.select(m < MIN_FRACTION, 2 / MIN_FRACTION - 1, dr.select(m < 0.5, (1 - m) / m, 1))
 
 
-@dr.syntax
-def middle_fraction(
-    probe: Probe, length: mi.Float, at_a: VisibilityProbe, at_b: VisibilityProbe, active: mi.Bool
-) -> mi.Float:
-    """Return the length of the interval around the middle of a segment in which probes differ from the ends.
+@dataclass
+class MiddlePart:
+    """The interval around the middle of a segment in which probes differ from those at the ends, while it is measured.
 
     A position belongs to the interval if its probe differs from the probe at one of the ends. The interval may contain
-    further edges. The result is a fraction of the length of the segment. In each half of the segment, the error is at
-    most 1/16 of this half.
+    further edges. In each half of the segment, the error of its length is at most 1/16 of this half.
     """
-    half = 0.5 * length
-    n, fraction, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
-    while dr.hint(active & (n < 2 * PARTS), exclude=[probe], label="pathreplay: part of a segment"):
-        side = dr.select(n < PARTS, mi.Float(-1), 1)
-        candidate = reach + step
-        seen = probe(side * half * candidate, mi.Bool(True))
-        differs = seen.differs(at_a) | seen.differs(at_b)
-        reach, step = dr.select(differs, candidate, reach), 0.5 * step
-        n += 1
-        done = (n == PARTS) | (n == 2 * PARTS)
-        fraction += dr.select(done, 0.5 * (reach + step), 0)
-        reach, step = dr.select(done, 0, reach), dr.select(done, 0.5, step)
-    return fraction
+
+    fraction: mi.Float  # length of the interval, relative to the segment; complete after 2 `PARTS` probes
+    reach: mi.Float  # largest distance from the middle with a different probe, relative to a half of the segment
+    step: mi.Float
+
+    @staticmethod
+    def begin() -> MiddlePart:
+        return MiddlePart(mi.Float(0), mi.Float(0), mi.Float(0.5))
+
+    def position(self, n: mi.UInt32, length: mi.Float) -> mi.Float:
+        """Return the position of the n-th probe."""
+        return dr.select(n < PARTS, -0.5, mi.Float(0.5)) * length * (self.reach + self.step)
+
+    def after(self, n: mi.UInt32, differs: mi.Bool) -> MiddlePart:
+        """Return the interval after the n-th probe."""
+        reach, step = dr.select(differs, self.reach + self.step, self.reach), 0.5 * self.step
+        done = (n == PARTS - 1) | (n == 2 * PARTS - 1)
+        fraction = self.fraction + dr.select(done, 0.5 * (reach + step), 0)
+        return MiddlePart(fraction, dr.select(done, 0, reach), dr.select(done, 0.5, step))
 
 
 @dr.syntax
@@ -243,32 +260,39 @@ def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32
     surface is merely curved. It also becomes 0 at a crack between triangles, through which few rays pass. A crack is
     assumed if many successive bisections have left one end of the interval unchanged, and a probe just beyond this end
     equals the probe at the other end.
+
+    One loop has three stages, so that the kernel contains the probe only once. The stages probe both ends, measure the
+    `MiddlePart` of segments whose ends have equal probes, and bisect.
     """
     a, b, _ = probe_positions(length)
     weight = mi.Float(weight)
-    at_a, at_b = probe(a, weight > 0), probe(b, weight > 0)
-    only_middle = (weight > 0) & ~at_a.differs(at_b)
-    weight = dr.select(
-        only_middle, middle_weight(middle_fraction(probe, length, at_a, at_b, only_middle)) * weight, weight
-    )
+    at_a, at_b, middle = VisibilityProbe.of(), VisibilityProbe.of(), MiddlePart.begin()
     n, unchanged, was_left = mi.UInt32(0), mi.UInt32(0), mi.Bool(False)
     while dr.hint(
-        (weight > 0) & ((n < BISECTIONS) | ((n == BISECTIONS) & (unchanged >= CRACK_BISECTIONS))),
+        (weight > 0) & ((n < END) | ((n == END) & (unchanged >= CRACK_BISECTIONS))),
         exclude=[probe],
         label="pathreplay: bisection",
     ):
-        halve, step = n < BISECTIONS, BEYOND * (b - a)
+        at_first, at_second, bisects = n == 0, n == 1, n >= ENDS_AND_MIDDLE
+        in_middle = (n >= ENDS) & ~bisects
+        halve, step = n < END, BEYOND * (b - a)
         c = dr.select(halve, 0.5 * (a + b), dr.select(was_left, a - step, b + step))
-        at_c = probe(c, mi.Bool(True))
-        to_a, to_b = at_c.edge_importance(at_a), at_c.edge_importance(at_b)
+        c = dr.select(in_middle, middle.position(n - ENDS, length), c)
+        seen = probe(dr.select(at_first, a, dr.select(at_second, b, c)), mi.Bool(True))
+
+        at_a, at_b = dr.select(at_first, seen, at_a), dr.select(at_second, seen, at_b)
+        to_a, to_b = seen.edge_importance(at_a), seen.edge_importance(at_b)
+        middle = dr.select(in_middle, middle.after(n - ENDS, (to_a > 0) | (to_b > 0)), middle)
+        weight *= dr.select(n == ENDS_AND_MIDDLE - 1, middle_weight(middle.fraction), 1)
+
         total = to_a + to_b
-        left = (to_b == 0) | (generator.next_float32() * total < to_a)
+        left = (to_b == 0) | (generator.next_float32(bisects) * total < to_a)
         inv_probability = dr.select(total > 0, total / dr.select(left, to_a, to_b), 0)
         no_crack = dr.select(was_left, to_b, to_a) > 0
-        weight *= dr.select(halve, inv_probability, dr.select(no_crack, 1, 0))
-        unchanged = dr.select(left == was_left, unchanged + 1, 1)
-        was_left = left
-        a, at_a = dr.select(left | ~halve, a, c), dr.select(left, at_a, at_c)
-        b, at_b = dr.select(left & halve, c, b), dr.select(left, at_c, at_b)
-        n += 1
+        weight *= dr.select(bisects, dr.select(halve, inv_probability, dr.select(no_crack, 1, 0)), 1)
+        unchanged = dr.select(bisects, dr.select(left == was_left, unchanged + 1, 1), unchanged)
+        was_left = bisects & left
+        a, at_a = dr.select(bisects & ~left & halve, c, a), dr.select(bisects & ~left, seen, at_a)
+        b, at_b = dr.select(bisects & left & halve, c, b), dr.select(bisects & left, seen, at_b)
+        n = dr.select(at_second & (to_a > 0), ENDS_AND_MIDDLE, n + 1)
     return Bracket(a, b, weight)

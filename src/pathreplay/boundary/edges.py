@@ -93,7 +93,7 @@ class EdgePath:
     k: mi.UInt32  # number of vertices; zero without an edge
     ray: mi.Ray3f
     layout: Layout
-    records: Any  # records of the k vertices, and of the arrival at the observer or at the edge
+    records: Any  # records of the k vertices, and of the arrival at the observer or edge; None if all k are 0
 
 
 @dataclass
@@ -125,7 +125,6 @@ def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spe
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
 
 
-@dr.syntax
 def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges, lost: NonFiniteCounter) -> mi.Spectrum:
     """Return what the edges contribute to the tangent of the radiance at the film positions.
 
@@ -137,7 +136,17 @@ def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges, lost: NonF
         ray = film.ray(path.s, path.key)[0]
         δo, δd = tangents(ray.o, ray.d)
     δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))
-    layout, records, k, ray0 = path.layout, path.records, path.k, dr.detach(ray)
+    if path.records is not None:
+        δ = _ray_to_edge(trace, path, dr.detach(ray), δ, lost)
+    return forward_ray(path.ray, δ, edges.motion)
+
+
+@dr.syntax
+def _ray_to_edge(
+    trace: TraceConfig, path: EdgePath, ray0: mi.Ray3f, δ: RayDerivative, lost: NonFiniteCounter
+) -> RayDerivative:
+    """Return the tangent of the path's last ray, given the tangent of the camera ray ``ray0``."""
+    layout, records, k = path.layout, path.records, path.k
     i, broken = mi.UInt32(0), mi.Bool(False)
     while dr.hint(i < k, exclude=[trace, layout, ray0, lost], label="pathreplay: towards an edge"):
         v = read_back(layout, records, i, k, ray0)
@@ -145,7 +154,7 @@ def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges, lost: NonF
         lost.add(~finite & ~broken)
         broken |= ~finite
         i += 1
-    return forward_ray(path.ray, δ, edges.motion)
+    return δ
 
 
 def ray_to_camera(
@@ -160,6 +169,8 @@ def ray_to_camera(
 
     With ``rays_only``, no parameter receives a gradient.
     """
+    if path.records is None:
+        return q
     k, none = path.k, mi.Spectrum(0)
     ray0 = dr.detach(film.ray(path.s, path.key)[0])
     recorded = RecordedPath(path.layout, path.records, mi.UInt32(0), mi.UInt32(k), mi.UInt32(k), ray0)

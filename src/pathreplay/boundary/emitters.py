@@ -39,7 +39,7 @@ from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.signature import edge_normal, outline_gap
 from pathreplay.transport.surface import surface_point
-from pathreplay.transport.vertex import TraceConfig, mis_weight
+from pathreplay.transport.vertex import TraceConfig, channel_mean, mis_weight
 
 BORDER = 1e-4
 """Width of a margin of the unit square that segments do not enter: the samples of some emitters are singular there, for
@@ -223,7 +223,7 @@ class EmitterSegment(PlaneSegment):
             scattered = [self.observer.towards(c, active)] * 3
         probes = [self._probe(sample) for sample in samples]
         for probe, sample, (f, pdf) in zip(probes, samples, scattered, strict=True):
-            probe.bright = dr.mean(dr.abs(x.β * f * sample.Le)) * self.inv_probability * self._mis(sample, pdf)
+            probe.bright = channel_mean(dr.abs(x.β * f * sample.Le)) * self.inv_probability * self._mis(sample, pdf)
         survey = Survey.of(probes, active)
         first = reduce(lambda p, q: dr.select(q.hidden & ~(p.hidden & (p.hit.t <= q.hit.t)), q, p), samples)
         survey.near = dr.select(first.hidden, closeness(trace, first.hit), 0)

@@ -24,7 +24,7 @@ from pathreplay.transport.signature import place_met, shape_met
 from pathreplay.transport.start import CameraStart, behind_emitters
 from pathreplay.transport.surface import met
 from pathreplay.transport.velocity import moved_direction
-from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, is_smooth
+from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, channel_mean, is_smooth
 from pathreplay.transport.volume.media import carried, extinction_of, span
 from pathreplay.transport.volume.passage import (
     further,
@@ -111,7 +111,7 @@ def choose_vertex(
         u, step = path.choose(trace, sampler)
         scatters, w = may_see(trace, path.at, step)
         share = dr.gather(mi.Float, shares, dr.minimum(count, len(shares) - 1), path.active)
-        m = dr.select(path.active & scatters, share * dr.mean(dr.abs(path.β * w)), 0)
+        m = dr.select(path.active & scatters, share * channel_mean(dr.abs(path.β * w)), 0)
         mass += m
         moves |= may_move(trace, path.at.hit)
         take = (m > 0) & (choice * mass < m)

@@ -12,10 +12,10 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import derivative_by_ray
-from pathreplay.adjoint.primal import path_radiance
+from pathreplay.adjoint.primal import two_radiances
 from pathreplay.boundary.arcs import Arc
 from pathreplay.boundary.creases import Crease, off_contact
-from pathreplay.boundary.crofton import Bracket, Survey, VisibilityProbe, bisect, probe_positions
+from pathreplay.boundary.crofton import Bracket, VisibilityProbe, bisect, probe_positions, survey
 from pathreplay.boundary.edges import Crossing
 from pathreplay.boundary.hard_shadows import HardShadow, ShadowTest
 from pathreplay.boundary.importance import DIM, Importance, closeness, own_plane
@@ -85,7 +85,7 @@ class ArcSegment(Arc):
         return glows | (self.observer.selected.depth + 2 < trace.max_depth)
 
     def _shadow_test(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> ShadowTest:
-        """Test whether the light that `path_radiance` samples at the hit reaches the hit point."""
+        """Test whether the light that `two_radiances` samples at the hit reaches the hit point."""
         sampler, depth = CounterSampler.stream(self.key, Stream.BEYOND_EDGE), self.observer.selected.depth
         arrival = self.observer.arrival(ray, hit, mi.Float(1))
         return ShadowTest.of(self.observer.trace, arrival, sampler, depth + 1, active)
@@ -93,10 +93,10 @@ class ArcSegment(Arc):
     def detect(self) -> Importance:
         """Estimate the importance of an edge that crosses this arc."""
         light = self.light
-        a, b, c = probe_positions(self.length)
-        survey = Survey.of([self.probe(t, self.active) for t in (a, b, c)], self.active)
-        survey.presence *= self.importance()
-        return Importance.of(survey, light, light * own_plane(self.observer, self.at(a), self.at(b)) / self.longest)
+        a, b, _ = probe_positions(self.length)
+        found = survey(self.probe, self.length, self.active)
+        found.presence *= self.importance()
+        return Importance.of(found, light, light * own_plane(self.observer, self.at(a), self.at(b)) / self.longest)
 
     def resolve(self, weight: mi.Float, generator: mi.PCG32) -> list[Crossing]:
         """Locate the edge by bisection, and compute the weights of both of its sides: see `EdgeSearch.resolve`."""
@@ -134,14 +134,14 @@ class ArcSegment(Arc):
         active = active & dr.any(common != 0)
         at_near, at_far = (observer.arrival(side.ray, side.hit, pdf) for side in (near, far))
         arrivals = off_contact(trace, at_near, at_far, active)
-        L, depth, shadow = [], x.depth + 1, edge.crease.shadow
+        depth, shadow = x.depth + 1, edge.crease.shadow
         # The light that is scattered into the rays before the edge cancels if directions move alike on both sides.
         alike = through | observer.keeps_direction
         alike = alike if shadow is None else alike | shadow.exists
         T, arrivals = observer.onward(arrivals, SHORT_OF * near.edge.t, self.key, active & alike)
-        for arrival in arrivals:
-            path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < trace.max_depth))
-            L.append(path_radiance(trace, CounterSampler.stream(self.key, Stream.BEYOND_EDGE), path)[0])
+        go_on, sampler = active & (depth < trace.max_depth), CounterSampler.stream(self.key, Stream.BEYOND_EDGE)
+        paths = [PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, go_on) for arrival in arrivals]
+        L = list(two_radiances(trace, sampler, *paths))
         if shadow is not None:  # the near side is dark, and the far side is too close to it for another test
             L[1] = dr.select(shadow.exists, L[0] + shadow.scattered(trace, arrivals[1], self.key, active), L[1])
         K_near, K_far = (dr.select(active, common * T * side, 0) for side in L)

@@ -57,6 +57,7 @@ class EdgeSearch(ABC, Generic[Segments]):
         A secondary search probes all segments of ``n`` paths instead. A part consists of every k-th segment, because
         consecutive segments are close to each other on the film.
         """
+        dr.make_opaque(seed)  # the kernels of the pilot pass use another seed
         search = self.guided(n, seed)
         parts = -(-n // AT_ONCE)
         for part in range(parts):
@@ -67,12 +68,26 @@ class EdgeSearch(ABC, Generic[Segments]):
         lanes = max(count // closer, 1)
         # Opaque: the kernels do not depend on the part. ``lane`` is the number of the part's first lane.
         first, step, width, lane = (dr.opaque(mi.UInt32, x) for x in (part, parts, count, part * lanes))
-        importance = self.detect(self.draw(first + step * dr.arange(mi.UInt32, count), mi.UInt32(0), n, seed))
+        importance = self.detect(self._part(first, step, count, n, seed))
         chosen = Resampled.of(importance, lanes, seed, lane)
         number = chosen.index // width
         i = first + step * (chosen.index - number * width)
         generator = mi.PCG32(lanes, initstate=seed + int(self.bisection), initseq=lane + dr.arange(mi.UInt32, lanes))
         return self.resolve(self.draw(i, number, n, seed), chosen.weight * dr.opaque(mi.Float, 1 / n), generator)
+
+    def _part(self, first: mi.UInt32, step: mi.UInt32, count: int, n: int, seed: mi.UInt32) -> Segments:
+        """Draw segments ``first``, ``first`` + ``step``, ... of n segments, ``count`` in total."""
+        return self.draw(first + step * dr.arange(mi.UInt32, count), mi.UInt32(0), n, seed)
+
+    def pilot(self, n: int, seed: mi.UInt32) -> Segments:
+        """Draw the segments of a pilot pass.
+
+        They are drawn like other segments, so that one kernel detects the edges on both.
+        """
+        n, seed = pilot_size(n, self.film.size), Stream.PILOT.of(seed)
+        dr.make_opaque(seed)
+        search = replace(self, density=self.density.tabulated())
+        return search._part(dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 1), n, n, seed)
 
     def guided(self, n: int, seed: mi.UInt32) -> EdgeSearch[Segments]:
         """Run a pilot pass, and return a search with a refined density. Without a pilot pass, return this search."""
@@ -161,19 +176,26 @@ class Resampled:
         dr.eval(mass)  # used twice below
         n = dr.width(mass)
         cdf = dr.cumsum(mi.Float64(mass))
-        total = dr.gather(mi.Float64, cdf, n - 1)
+        stratum = dr.gather(mi.Float64, cdf, dr.opaque(mi.UInt32, n - 1)) / dr.opaque(mi.Float64, lanes)
         lane = dr.arange(mi.UInt32, lanes)
-        x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, first + lane, ROUNDS))) * (total / lanes)
+        x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, first + lane, ROUNDS))) * stratum
         index = _index_at(cdf, x)
         importance = dr.gather(mi.Float, mass, index)
-        return Resampled(index, dr.select(importance > 0, mi.Float(total / lanes) / importance, 0))
+        return Resampled(index, dr.select(importance > 0, mi.Float(stratum) / importance, 0))
 
 
+@dr.syntax
 def _index_at(cdf: mi.Float64, x: mi.Float64 | mi.Float) -> mi.UInt32:
-    """Return the index of the first entry of ``cdf`` above ``x``, or the last index."""
-    last = dr.width(cdf) - 1
-    i = dr.binary_search(0, last, lambda i: dr.gather(mi.Float64, cdf, i) <= x)
-    return mi.UInt32(dr.minimum(i, last))  # `binary_search` returns a Python integer if there is one entry
+    """Return the index of the first entry of ``cdf`` above ``x``, or the last index.
+
+    Kernels with this loop do not depend on the number of entries, and kernels with `dr.binary_search` do.
+    """
+    low, high = mi.UInt32(0), dr.opaque(mi.UInt32, dr.width(cdf) - 1)
+    while dr.hint(low < high, exclude=[cdf, x], label="pathreplay: binary search"):
+        middle = (low + high) >> 1
+        below = dr.gather(mi.Float64, cdf, middle) <= x
+        low, high = dr.select(below, middle + 1, low), dr.select(below, high, middle)
+    return low
 
 
 def pilot_size(n: int, size: mi.ScalarVector2f) -> int:
@@ -219,6 +241,15 @@ class SegmentDensity:
         probability = dr.select(total > 0, dr.fma(counts, (1 - unrefined) / total, unrefined * previous), previous)
         cdf = dr.cumsum(mi.Float64(probability))
         return SegmentDensity(self.width, self.height, self.margin, cdf / dr.gather(mi.Float64, cdf, n - 1))
+
+    def tabulated(self) -> SegmentDensity:
+        """Return this density, with a table of its cumulative probabilities."""
+        if self.cdf is not None:
+            return self
+        n = self.width * self.height
+        cdf = mi.Float64(dr.arange(mi.UInt32, n) + 1) / n
+        dr.make_opaque(cdf)
+        return replace(self, cdf=cdf)
 
     def _probability(self, i: mi.UInt32) -> mi.Float:
         if self.cdf is None:

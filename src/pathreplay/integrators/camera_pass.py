@@ -97,8 +97,8 @@ class Pass:
             film = self.sensor.film()
             border = 2 * film.rfilter().border_size() if film.sample_border() else 0
             width, height = (n + border for n in self.size)
-            i = dr.arange(mi.UInt32, width * height * spp)
-            sampler = self.sobol_sampler(i // spp, width, i % spp, spp)
+            i, paths = dr.arange(mi.UInt32, width * height * spp), dr.opaque(mi.UInt32, spp)
+            sampler = self.sobol_sampler(i // paths, width, i % paths, spp)
             # `sample_rays` also needs the number of paths per pixel.
             camera = SimpleNamespace(sample_count=lambda: spp, next_1d=sampler.next_1d, next_2d=sampler.next_2d)
         else:
@@ -128,13 +128,14 @@ class Pass:
         """Create the Sobol sampler of one path of a pixel.
 
         ``path`` is the index of the path in the pixel, which has ``paths`` paths in total. ``pixel`` is the row-major
-        index of the pixel in a film of ``width`` pixels. Samplers with different values of ``of`` are independent.
+        index of the pixel in a film of ``width`` pixels. Samplers with different values of ``of`` are independent. The
+        kernels depend neither on ``width`` nor on ``paths``.
         """
-        bits = (paths - 1).bit_length()
-        morton = morton_index(pixel % width, pixel // width)
+        bits, row = dr.opaque(mi.UInt32, (paths - 1).bit_length()), dr.opaque(mi.UInt32, width)
+        morton = morton_index(pixel % row, pixel // row)
         # A Sobol index has 32 bits. The bits of ``morton`` that do not fit select the set of samples, with the seed and
-        # ``of``.
-        overflow = morton >> (32 - bits) if bits else mi.UInt32(0)
+        # ``of``. The index of a pixel has fewer than 32 bits.
+        overflow = (morton >> 1) >> (31 - bits)
         return OwenSobolSampler.of((morton << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), overflow))
 
     @property

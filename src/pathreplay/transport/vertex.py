@@ -308,6 +308,11 @@ def reciprocal(x: Real) -> Real:
     return dr.select(x != 0, dr.rcp(x), 0)
 
 
+def channel_mean(x: mi.Spectrum) -> mi.Float:
+    """Return the mean over the channels. `dr.mean` would make the number of lanes a constant of the kernel."""
+    return dr.sum(x) * (1 / len(x))
+
+
 def is_smooth(bsdf: mi.BSDFPtr) -> mi.Bool:
     """Return the lanes whose BSDF has a smooth lobe, so that next-event estimation is possible."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)

@@ -33,7 +33,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import NonFiniteCounter, derivative_by_place, derivative_by_ray
-from pathreplay.adjoint.primal import path_radiance
+from pathreplay.adjoint.primal import two_radiances
 from pathreplay.boundary.chains import (
     ChainSplit,
     begin_chain,
@@ -48,7 +48,7 @@ from pathreplay.boundary.crofton import VisibilityProbe, heading
 from pathreplay.boundary.edges import Edges, ray_to_camera
 from pathreplay.boundary.hard_shadows import HardShadow
 from pathreplay.boundary.observer import arrival_beyond
-from pathreplay.boundary.search import FilmSearch, FilmSegment, pilot_size
+from pathreplay.boundary.search import FilmSearch, FilmSegment
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.path import PathState
@@ -135,15 +135,18 @@ class PrimarySearch(FilmSearch[FilmSegment]):
 
     def guided(self, n: int, seed: mi.UInt32) -> PrimarySearch:
         """Refine the density with a pilot pass (see `EdgeSearch`). Pilot segments have twice the usual length."""
-        wide, n_pilot = replace(self, length=2 * self.length), pilot_size(n, self.film.size)
-        pilot = wide.draw(dr.arange(mi.UInt32, n_pilot), mi.UInt32(0), n_pilot, Stream.PILOT.of(seed))
-        return replace(self, density=self.density.refined(pilot.c, wide.detect(pilot) * pilot.density))
+        wide = replace(self, length=2 * self.length)
+        pilot = wide.pilot(n, seed)
+        importance = wide.detect(pilot)
+        dr.eval(importance)
+        return replace(self, density=self.density.refined(pilot.c, importance * pilot.density))
 
     def draw(self, i: mi.UInt32, number: mi.UInt32, n: int, seed: mi.UInt32) -> FilmSegment:
         x, y, turn = quasi_random(i, n, seed, 3)
         c, density = self.density.draw(x, y)
         key = key_of(i, Stream.PRIMARY_KEYS.of(seed))
-        return FilmSegment(c, heading(mi.Float(turn)), mi.Float(self.length), key, density, mi.Bool(True))
+        length = dr.opaque(mi.Float, self.length)  # one kernel for all lengths
+        return FilmSegment(c, heading(mi.Float(turn)), length, key, density, mi.Bool(True))
 
     def probe(self, segment: FilmSegment, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
         s = segment.at(t)
@@ -213,7 +216,5 @@ def behind_edges(trace: TraceConfig) -> TraceConfig:
 
 def jump_between(trace: TraceConfig, sides: Sides, key: mi.UInt32) -> mi.Spectrum:
     """Estimate f_a - f_b, with the same random numbers on both sides. ``trace`` is that of `behind_edges`."""
-    f = [path_radiance(trace, CounterSampler.at_vertex(key, sides.k), path)[0] for path in sides.paths()]
-    if sides.shadow is None:
-        return f[0] - f[1]
-    return dr.select(sides.shadow.exists, sides.shadow_jump(trace, key), f[0] - f[1])
+    a, b = two_radiances(trace, CounterSampler.at_vertex(key, sides.k), *sides.paths())
+    return a - b if sides.shadow is None else dr.select(sides.shadow.exists, sides.shadow_jump(trace, key), a - b)

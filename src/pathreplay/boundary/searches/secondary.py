@@ -29,7 +29,7 @@ from pathreplay.boundary.emitters import EmitterSegment
 from pathreplay.boundary.importance import MOST, UNFORESEEN, VERTICES, Importance, Importances, repeated
 from pathreplay.boundary.observer import ObserverVertex, SelectedVertex, choose_vertex
 from pathreplay.boundary.occlusion import ArcSegment
-from pathreplay.boundary.search import EdgeSearch, SegmentDensity, pilot_size
+from pathreplay.boundary.search import EdgeSearch, SegmentDensity
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.scatter import may_keep_directions
@@ -89,7 +89,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     def of(trace: TraceConfig, film: FilmDomain, lengths: tuple[float, float]) -> SecondarySearch:
         trace = recordable(trace)
         density = SegmentDensity.uniform(film.size, 0.0)
-        return SecondarySearch(trace, film, density, lengths, dr.ones(mi.Float, VERTICES))
+        return SecondarySearch(trace, film, density, lengths, dr.opaque(mi.Float, 1, VERTICES))
 
     def guided(self, n: int, seed: mi.UInt32) -> SecondarySearch:
         """Refine the density with a pilot pass (see `EdgeSearch`). Some pilot segments are drawn at cast shadows."""
@@ -97,9 +97,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         if shapes := casters(self.trace):
             s, falls = cast_shadows(self.trace, shapes, self.film, Stream.CAST_SHADOWS.of(seed))
             density = density.refined(s, dr.select(falls, mi.Float(1), 0), UNGUIDED)
-        n_pilot = pilot_size(n, self.film.size)
-        search, i = replace(self, density=density), dr.arange(mi.UInt32, n_pilot)
-        pilot = search.draw(i, mi.UInt32(0), n_pilot, Stream.PILOT.of(seed))
+        pilot = replace(self, density=density).pilot(n, seed)
         importances = self._importances(pilot)
         radiance = importances.radiance()
         importance = importances.weighed(radiance)[1]
@@ -183,11 +181,12 @@ class SecondarySearch(EdgeSearch[CameraPath]):
 
         It is divided by the number of arcs around the vertex.
         """
-        search, arcs, number = self, self._arc_count(observer), dr.zeros(mi.UInt32, n)
+        search, arcs, number = self, self._arc_count(observer), mi.UInt32(0)
+        i, stride = dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, n)
         while dr.hint(number < arcs, exclude=[search, observer, path, found], label="pathreplay: arcs"):
             arc = search._arc(observer, path.key, number + 1).detect()
-            i = number * n + dr.arange(mi.UInt32, n)
             dr.scatter(found.presence, arc.presence / (path.density * arcs), i)
             dr.scatter(found.edges, arc.edges / arcs, i)
             dr.scatter(found.light, arc.light / arcs, i)
+            i += stride
             number += 1

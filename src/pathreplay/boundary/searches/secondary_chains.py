@@ -30,14 +30,14 @@ from pathreplay.boundary.crofton import VisibilityProbe, bisect, crossing_weight
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
 from pathreplay.boundary.importance import UNFORESEEN, finite, repeated
 from pathreplay.boundary.observer import ObserverVertex
-from pathreplay.boundary.search import EdgeSearch, SegmentDensity, pilot_size
+from pathreplay.boundary.search import EdgeSearch, SegmentDensity
 from pathreplay.boundary.searches.primary import ChainEdge, FilmCrossing, Sides, behind_edges, jump_between
 from pathreplay.boundary.searches.secondary import UNGUIDED, CameraPath
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
-from pathreplay.transport.vertex import TraceConfig
+from pathreplay.transport.vertex import TraceConfig, channel_mean
 
 EVERY, ARCS = 4, 8
 """The search has 1 / `EVERY` of the usual number of paths, with `ARCS` arcs around a vertex of each. Tracing a path
@@ -75,7 +75,7 @@ class ChainArc(Arc):
         depend on the scattering in this direction alone.
         """
         presence = detect(self.probe, self.length, self.active) * self.importance()
-        light = self.light + UNFORESEEN * dr.mean(dr.abs(self.observer.selected.β))
+        light = self.light + UNFORESEEN * channel_mean(dr.abs(self.observer.selected.β))
         return finite(dr.select(self.active, presence * light, 0))
 
     def tangent(self, t: mi.Float) -> mi.Vector3f:
@@ -108,8 +108,7 @@ class SecondaryChainSearch(EdgeSearch[CameraPath]):
 
     def guided(self, n: int, seed: mi.UInt32) -> SecondaryChainSearch:
         """Refine the density of film positions with a pilot pass (see `EdgeSearch`)."""
-        n_pilot = pilot_size(n, self.film.size)
-        pilot = self.draw(dr.arange(mi.UInt32, n_pilot), mi.UInt32(0), n_pilot, Stream.PILOT.of(seed))
+        pilot = self.pilot(n, seed)
         importance = self.detect(pilot)
         s = mi.Point2f(*(repeated(x, importance) for x in pilot.s))
         return replace(self, density=self.density.refined(s, dr.select(importance > 0, mi.Float(1), 0), UNGUIDED))
@@ -161,10 +160,11 @@ class SecondaryChainSearch(EdgeSearch[CameraPath]):
     @dr.syntax
     def _detect_arcs(self, observer: ObserverVertex, path: CameraPath, n: int, importance: mi.Float) -> None:
         """Write the importance of all arcs of ``n`` paths to ``importance``."""
-        search, number = self, dr.zeros(mi.UInt32, n)
+        search, number, i, stride = self, mi.UInt32(0), dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, n)
         while dr.hint(number < ARCS, exclude=[search, observer, path, importance], label="pathreplay: chain arcs"):
             found = search._arc(observer, replace(path, number=number)).importance_of_edges()
-            dr.scatter(importance, found, number * n + dr.arange(mi.UInt32, n))
+            dr.scatter(importance, found, i)
+            i += stride
             number += 1
 
     def _slope(self, path: EdgePath, edge: ChainEdge, d: mi.Vector3f, k: mi.UInt32) -> mi.Vector3f:

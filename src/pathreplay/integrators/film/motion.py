@@ -47,7 +47,7 @@ from pathreplay.integrators.term import Term, TermResult
 from pathreplay.samplers.owen_sobol import OwenSobolSampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.start import CameraStart
-from pathreplay.transport.vertex import TraceConfig
+from pathreplay.transport.vertex import TraceConfig, channel_mean
 
 GROUP = 5
 """Number of paths with the same random numbers: right and left, above and below, and one for the divergence."""
@@ -150,7 +150,7 @@ class FilmMotion(Term):
         position = (mi.Point2f(pixel % width, pixel // width) + sampler.next_2d()) / mi.Point2f(width, height)
         sample = Sample(view.sensor.shutter_open(), sampler.next_1d(), position, sampler.next_2d())
         moving = dr.full(mi.Bool, True, width * height) & self.flow.moves_at(position)
-        L = dr.mean(_radiance(view, trace, sample, sampler, moving)[0])
+        L = channel_mean(_radiance(view, trace, sample, sampler, moving)[0])
         dr.eval(L)  # two sums follow
         n = dr.maximum(mi.Float(dr.count(moving)), 1)
         most = CLIP * dr.square(dr.sum(dr.safe_sqrt(L)) / n)
@@ -158,17 +158,17 @@ class FilmMotion(Term):
 
     def _trace(self, view: Pass, trace: TraceConfig) -> FlowPaths:
         width, height = view.size
-        groups = -(-view.spp // self.flow.samples)
-        i = dr.arange(mi.UInt32, width * height * groups * GROUP)
+        number = -(-view.spp // self.flow.samples)
+        i, groups = dr.arange(mi.UInt32, width * height * number * GROUP), dr.opaque(mi.UInt32, number)
         member, group = i % GROUP, i // GROUP
         pixel, single, axis = group // groups, member == GROUP - 1, member // 2
-        sampler = view.sobol_sampler(pixel, width, group % groups, groups, Stream.FLOW)
+        sampler = view.sobol_sampler(pixel, width, group % groups, number, Stream.FLOW)
 
         sensor, film, u = view.sensor, view.sensor.film(), sampler.next_2d()
         places, filter, derivative = FilmPlaces.of(view), FilterSamples.of(film), FilterSamples.of_derivative(film)
         middle = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + 0.5
         middle += mi.Point2f(mi.ScalarPoint2f(film.crop_offset()) - places.corner)
-        s, weight, offset = mi.Point2f(0), mi.Float(1 / groups), mi.Float(0)
+        s, weight, offset = mi.Point2f(0), dr.rcp(mi.Float(groups)), mi.Float(0)
         for k in range(2):
             low, high = filter.cdf_at(-middle[k]), filter.cdf_at(places.size[k] - middle[k])
             x, away = filter.draw(u[k], low, high), derivative.draw(u[k], mi.Float(0.5), mi.Float(1))

@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.samplers.sampler import Sampler
-from pathreplay.transport.vertex import Arrival, Flight, NullCollision, TraceConfig, reciprocal
+from pathreplay.transport.vertex import Arrival, Flight, NullCollision, TraceConfig, channel_mean, reciprocal
 from pathreplay.transport.volume.media import (
     Grid,
     Media,
@@ -102,7 +102,7 @@ def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, acti
         if dr.hint(trace.branch, mode="scalar"):
             assert trace.branching is not None
             share = trace.branching * branch_weight(p, trace.branching) / σ_bar
-            m = share * dr.mean(dr.abs(β) * dr.maximum(dr.abs(W), 1))
+            m = share * channel_mean(dr.abs(β) * dr.maximum(dr.abs(W), 1))
             mass += dr.select(flying, m, 0)
             nulls += dr.select(flying, 1, 0)
             kept = flying & (sampler.next_1d(flying) * mass < m)
@@ -179,7 +179,7 @@ def _reality(media: Media, βW: mi.Spectrum, σ_t: mi.Spectrum, σ_bar: mi.Float
     p = σ_t[0] / σ_bar
     if media.chromatic:
         total = dr.sum(βW)
-        p = dr.select(total > 0, dr.sum(βW * σ_t) / (σ_bar * total), dr.mean(σ_t) / σ_bar)
+        p = dr.select(total > 0, dr.sum(βW * σ_t) / (σ_bar * total), channel_mean(σ_t) / σ_bar)
     return dr.clip(p, 0, 1)
 
 
