@@ -72,9 +72,9 @@ class Crease:
         B is differentiable in the ray and in the shapes.
         """
         meets, turns = active & self.meets, active & self.turns
-        t = [hit.compute_surface_interaction(ray, compat.shading(), meets).t for hit in (self.a, self.b)]
-        si = self.a.compute_surface_interaction(ray, compat.shading(), turns)
-        B = dr.select(meets, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), 0))
+        a = self.a.compute_surface_interaction(ray, compat.shading(), meets | turns)
+        b = self.b.compute_surface_interaction(ray, compat.shading(), meets)
+        B = dr.select(meets, a.t - b.t, dr.select(turns, dr.dot(a.sh_frame.n, ray.d), 0))
         if self.sunsky is not None:
             B = dr.select(active & self.sky, horizon_gap(self.sunsky, ray.d), B)
         return B if self.shadow is None else dr.select(self.shadow.exists, self.shadow.gap(ray, active), B)

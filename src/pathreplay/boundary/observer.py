@@ -94,11 +94,12 @@ def choose_vertex(
 
     In lanes with ``flows`` (see `FilmDomain`), the camera ray may move, so that all vertices count as moving. Vertices
     are written to ``records`` unless ``records`` is None. A path with `max_depth` vertices scatters no light at its
-    last vertex, which is therefore not traced.
+    last vertex, which is therefore not traced. If all paths therefore end at their first vertex, this vertex has no
+    predecessors, and None is returned in place of the records.
     """
     room, trace = room_for(trace), replace(trace, max_depth=max(trace.max_depth - 1, 0))
     path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)))
-    if dr.hint(trace.max_depth == 1 and trace.media is None and records is None, mode="scalar"):
+    if dr.hint(trace.max_depth == 1 and trace.media is None, mode="scalar"):
         return None, _first_vertex(trace, path, flows)
     none, no = mi.UInt32(0), mi.Bool(False)
     flight = None if trace.media is None else Flight.none(trace.media)

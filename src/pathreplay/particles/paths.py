@@ -61,7 +61,8 @@ class Particles:
     def start(self, trace: TraceConfig, i: mi.UInt32) -> EmitterStart:
         """Return the start of the light paths with indices ``i``; lanes with ``i`` >= ``number`` are inactive."""
         sampler = OwenSobolSampler.of(i, self.key)
-        return EmitterStart(trace, self.emission, EmitterSamples.draw(sampler), sampler, i < self.number)
+        active = i < dr.opaque(mi.UInt32, self.number)  # kernels do not depend on the number
+        return EmitterStart(trace, self.emission, EmitterSamples.draw(sampler), sampler, active)
 
     def moves(self, trace: TraceConfig) -> bool:
         """Return whether light paths or their film positions depend on parameters with gradients."""
