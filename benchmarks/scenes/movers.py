@@ -210,6 +210,12 @@ def _textured_ball() -> SceneDict:
     return _ball([0, 0, 0], 0.8, {"type": "diffuse", "reflectance": _texture(0.1, 0.9)})
 
 
+def _under_the_sky(bsdf: SceneDict) -> Mover:
+    """A ball that slides over a floor."""
+    scene = _scene(_above, floor=_floor, object=lambda: _ball([0, 0.1, 0], 0.5, bsdf), sky=lambda: SKY)
+    return Mover(scene, _slide(1, 0.3, 0))
+
+
 MOVERS: dict[str, Mover] = {
     "head turns": Mover(_scene(object=lambda: _head([0, 0, 0], 0.7), sky=lambda: SKY), _turn_vertices),
     "shadow of the head": Mover(
@@ -244,10 +250,10 @@ MOVERS: dict[str, Mover] = {
         _scene(_above, floor=_floor, object=lambda: _ball([0, 0.1, 0], 0.5, {"type": "conductor"}), lamp=_lamp),
         _slide(1, 0.3, 0),
     ),
-    "ball of glass": Mover(
-        _scene(_above, floor=_floor, object=lambda: _ball([0, 0.1, 0], 0.5, {"type": "dielectric"}), sky=lambda: SKY),
-        _slide(1, 0.3, 0),
-    ),
+    "ball of glass": _under_the_sky({"type": "dielectric"}),
+    "ball of rough metal": _under_the_sky({"type": "roughconductor", "alpha": 0.15}),
+    "ball of rough plastic": _under_the_sky({"type": "roughplastic", "alpha": 0.15}),
+    "ball of frosted glass": _under_the_sky({"type": "principled", "roughness": 0.3, "spec_trans": 0.6, "eta": 1.4}),
     "small in a room": Mover(
         _scene(_above, floor=_floor, wall=_wall, object=lambda: _ball([0.3, -0.3, 0.5], 0.06), lamp=_lamp),
         _slide(1, 0.3, 0),

@@ -58,6 +58,9 @@ MOVING = {
     "behind a pane": (PLACE, 4),
     "ball of metal": (PLACE, 4),
     "ball of glass": (PLACE, 4),
+    "ball of rough metal": (PLACE, 4),
+    "ball of rough plastic": (PLACE, 4),
+    "ball of frosted glass": (PLACE, 4),
     "small in a room": (PLACE, 3),
 }
 """Scenes for derivatives with respect to one number: the key of the moving parameter, and the depth."""
