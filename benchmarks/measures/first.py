@@ -1,4 +1,4 @@
-"""Times one process from its start to its second gradient, and prints the seconds of each stage as one JSON list.
+"""Times one process from its start to its third gradient, and prints the seconds of each stage as one JSON list.
 
 `start.py` runs `python -m benchmarks.measures.first JOB`, where JOB has one method, an integrator. For an integrator of
 Mitsuba, the process imports only what this integrator needs, and in particular not pathreplay. The integrator is
@@ -29,7 +29,10 @@ def _set_variant(ours: bool) -> None:
 
 
 def main(text: str) -> list[float]:
-    """Return the seconds of three stages: import and variant; scene and first gradient; second gradient."""
+    """Return the seconds of four stages.
+
+    The stages are import and variant; scene and first gradient; second gradient; a gradient with half the samples.
+    """
     (method,) = json.loads(text)["methods"]
     _set_variant(method not in STOCK)
     imported = time.perf_counter()
@@ -49,8 +52,8 @@ def main(text: str) -> list[float]:
     integrator = mi.load_dict(METHODS[method] | job.limits)
     adjoint = dr.full(mi.TensorXf, 1.0, (job.resolution, job.resolution, 3))
     marks = [BEGIN, imported]
-    for seed in (0, 1):
-        integrator.render_backward(scene, params, adjoint, seed=seed, spp=job.spp)
+    for seed, spp in ((0, job.spp), (1, job.spp), (2, job.spp // 2)):
+        integrator.render_backward(scene, params, adjoint, seed=seed, spp=spp)
         dr.eval(dr.grad(params[key]))
         dr.sync_thread()
         marks.append(time.perf_counter())

@@ -57,7 +57,7 @@ DIFFERENCE = "central difference"
 #: Ways: the loop of an optimisation step, whether a step was recorded, and what a new process does first.
 USUAL, OWN = "usual loop", "own loop"
 TRACED, RECORDED = "traced", "recorded"
-STAGES = ("import", "first gradient", "second gradient")
+STAGES = ("import", "first gradient", "second gradient", "half the samples")
 
 
 def parts(method: str) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""Times new processes from import to second gradient, with or without a kernel cache, for the task `startup`."""
+"""Times new processes from import to third gradient, with or without a kernel cache, for the task `startup`."""
 
 from __future__ import annotations
 

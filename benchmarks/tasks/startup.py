@@ -1,4 +1,4 @@
-"""Task `startup`: seconds until a new process has computed its first and its second gradient."""
+"""Task `startup`: seconds until a new process has computed its first gradients, of a texture and of a mesh."""
 
 from __future__ import annotations
 
@@ -6,11 +6,17 @@ import statistics as st
 
 from ..measures.job import Job, Record
 from ..measures.methods import STAGES
-from ..tables import groups, markdown
+from ..tables import markdown
 
 TITLE = "startup"
-TAKES = (15, 20)
-METHODS = ("prb", "sweep")
+TAKES = (60, 240)
+PARAMETERS = {
+    "back.bsdf.reflectance.data": ("prb", "sweep"),
+    "small-box.vertex_positions": ("prb_projective", "boundary and interior"),
+}
+"""Methods by parameter. The edges of the mesh move with its vertices."""
+MEASURES = ("cold start", "warm start")
+"""With an empty and with a filled kernel cache."""
 
 
 def jobs(quick: bool) -> list[Job]:
@@ -18,8 +24,8 @@ def jobs(quick: bool) -> list[Job]:
     return [
         Job(
             scene="cornell-box",
-            parameters=("back.bsdf.reflectance.data",),
-            methods=tuple(f"{method}, {stage}" for stage in STAGES for method in METHODS),
+            parameters=(parameter,),
+            methods=tuple(f"{method}, {stage}" for stage in STAGES for method in methods),
             max_depth=8,
             rr_depth=5,
             resolution=64,
@@ -28,19 +34,22 @@ def jobs(quick: bool) -> list[Job]:
             warmup=1,
             measure=measure,
         )
-        for measure in ("cold start", "warm start")
+        for parameter, methods in PARAMETERS.items()
+        for measure in MEASURES
     ]
 
 
 def table(record: Record) -> str:
-    """Format seconds by kernel cache and stage, with the fastest and the slowest process in brackets."""
+    """Format seconds by parameter, kernel cache and stage, with the fastest and the slowest process in brackets."""
     rows = []
-    for measure in dict.fromkeys(point.measure for point in record.points):
-        found = next(iter(groups(point for point in record.points if point.measure == measure).values()))
-        for stage in STAGES:
-            points = [found.get(f"{method}, {stage}") for method in METHODS]
-            rows.append([measure, stage, *("" if p is None else p.error or _seconds(p.seconds) for p in points)])
-    return markdown(["kernel cache", "stage", *(f"{method}, s" for method in METHODS)], rows)
+    for parameter, methods in PARAMETERS.items():
+        for measure in MEASURES:
+            found = {p.method: p for p in record.points if (p.parameters, p.measure) == ((parameter,), measure)}
+            for method in methods:
+                points = [found.get(f"{method}, {stage}") for stage in STAGES]
+                cells = ("" if p is None else p.error or _seconds(p.seconds) for p in points)
+                rows.append([parameter, measure, method, *cells])
+    return markdown(["parameter", "kernel cache", "method", *(f"{stage}, s" for stage in STAGES)], rows)
 
 
 def _seconds(seconds: tuple[float, ...]) -> str:

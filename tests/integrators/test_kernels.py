@@ -1,8 +1,12 @@
-"""Kernels do not depend on the samples per pixel: whoever takes more of them waits for no compiler."""
+"""Kernels do not depend on the samples per pixel: whoever takes more of them waits for no compiler.
+
+Mitsuba itself has two kernels: one for samples per pixel that are a power of two, and one for all others.
+"""
 
 from __future__ import annotations
 
 import gc
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -12,16 +16,25 @@ import pytest
 
 import edge_media_scenes as media
 import edge_scenes as scenes
-from truth import translate
+from truth import RES, translate
 
 FEW = 1000
 """Operations of kernels that may be compiled again: sums over all samples, and the like."""
 PASSES = {
-    "boundary": lambda: ({"boundary": "all"}, scenes.scene(**parts())),
+    "boundary": lambda: ({"boundary": "all"}, scenes.scene(**without_pane())),
+    "direct light": lambda: ({"boundary": "all", "max_depth": 2}, scenes.scene(**without_pane())),
+    "hard shadows": lambda: ({"boundary": "all"}, scenes.scene(**without_pane(), bulb=BULB)),
+    "pane": lambda: ({"boundary": "all"}, scenes.scene(**parts())),
     "caustics": lambda: ({"boundary": "all", "caustics": "particles"}, scenes.scene(**parts())),
     "in fog": lambda: ({"boundary": "all"}, media.in_fog(media.thin(), **parts())),
     "light paths": lambda: ({"type": "pathreplay_particles"}, scenes.scene(**parts())),
 }
+
+BULB = {"type": "point", "position": [2, 2, 3], "intensity": 9.0}
+
+
+def without_pane() -> dict[str, Any]:
+    return {name: part for name, part in parts().items() if name != "pane"}
 
 
 def parts() -> dict[str, Any]:
@@ -54,4 +67,21 @@ def test_other_samples_are_no_other_kernels(make: Callable[[], tuple[dict[str, A
             dr.eval()
             history = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
         compiled.append(sum(entry["operation_count"] for entry in history if not entry["cache_hit"]))
-    assert max(compiled[2:]) < FEW, compiled
+    assert compiled[0] > 10 * FEW and max(compiled[2:]) < FEW, compiled
+
+
+def test_a_pilot_pass_launches_the_kernels_of_the_search() -> None:
+    """Edges that the camera sees, edges that surfaces see, and those behind the pane: each twice."""
+    gc.collect()
+    scene = mi.load_dict(scenes.scene(**parts()))
+    params = mi.traverse(scene)
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 4, "boundary": "all"})
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    params["object.to_world"] = translate(1, 0, 0)(mi.Transform4f(params["object.to_world"]), x)
+    params.update()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (RES, RES, 3)), spp=16)
+        launched = Counter(entry["hash"] for entry in dr.kernel_history() if entry.get("operation_count", 0) > FEW)
+    assert sum(count == 2 for count in launched.values()) >= 3, launched

@@ -221,7 +221,7 @@ def record_chain(
     """Record the first ``k`` vertices of the chain along ``ray``.
 
     The ray ``at`` leads from the last of these vertices to an edge. Returns the recorded path, and the lanes in which
-    the chain passes all ``k`` vertices.
+    the chain passes all ``k`` vertices. In a scene without delta lobes, ``k`` is 0, and nothing is recorded.
     """
     layout = Layout.of(trace, True)
     if not trace.traits.mirrors:
@@ -250,7 +250,6 @@ def _records_of_chain(
     return records, count
 
 
-@dr.syntax
 def transmittance_of_chain(
     trace: TraceConfig,
     ray: mi.Ray3f,
@@ -265,8 +264,24 @@ def transmittance_of_chain(
     The chain starts in ``medium``. Also returns the medium at the distance ``reach``.
     """
     chain = chain_config(trace)
+    path = PathState.begin(chain, CameraStart(ray, CounterSampler.of(key), active))
+    if not trace.traits.mirrors:
+        sampler = CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_CHAIN)
+        return transmittance_up_to(trace, path.at.ray, reach, medium, sampler, path.active)
+    return _transmittance_of_chain(trace, chain, path, medium, key, k, reach)
+
+
+@dr.syntax
+def _transmittance_of_chain(
+    trace: TraceConfig,
+    chain: TraceConfig,
+    path: PathState,
+    medium: mi.MediumPtr,
+    key: mi.UInt32,
+    k: mi.UInt32,
+    reach: mi.Float,
+) -> tuple[mi.Spectrum, mi.MediumPtr]:
     sampler, transmittance_sampler = CounterSampler.of(key), CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_CHAIN)
-    path = PathState.begin(chain, CameraStart(ray, sampler, active))
     T = mi.Spectrum(1)
     count = mi.UInt32(0)
     while dr.hint(path.active & (count <= k), exclude=[trace, chain], label="pathreplay: transmittance of a chain"):

@@ -42,8 +42,8 @@ PARTS = 3
 """Number of probes with which `MiddlePart` locates each of its ends."""
 MIN_FRACTION = 9 / 32
 """Fraction below which `middle_weight` is constant. It is halfway between two values of `MiddlePart.fraction`."""
-ENDS, ENDS_AND_MIDDLE, END = 2, 2 + 2 * PARTS, 2 + 2 * PARTS + BISECTIONS
-"""Numbers of probes after which the stages of `bisect` end."""
+AFTER_ENDS, AFTER_MIDDLE, AFTER_BISECTIONS = 2, 2 + 2 * PARTS, 2 + 2 * PARTS + BISECTIONS
+"""Values of the counter of `bisect` after its first three stages."""
 BEYOND = 1.5
 """Distance beyond the fixed end at which a suspected crack is probed, in lengths of the final interval. In the square
 of an emitter this distance is less than `emitters.BORDER`."""
@@ -261,29 +261,29 @@ def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32
     assumed if many successive bisections have left one end of the interval unchanged, and a probe just beyond this end
     equals the probe at the other end.
 
-    One loop has three stages, so that the kernel contains the probe only once. The stages probe both ends, measure the
-    `MiddlePart` of segments whose ends have equal probes, and bisect.
+    One loop has four stages, so that the kernel contains the probe only once. The stages probe both ends, measure the
+    `MiddlePart` of segments whose ends have equal probes, bisect, and probe beyond an end that may be at a crack.
     """
     a, b, _ = probe_positions(length)
     weight = mi.Float(weight)
     at_a, at_b, middle = VisibilityProbe.of(), VisibilityProbe.of(), MiddlePart.begin()
     n, unchanged, was_left = mi.UInt32(0), mi.UInt32(0), mi.Bool(False)
     while dr.hint(
-        (weight > 0) & ((n < END) | ((n == END) & (unchanged >= CRACK_BISECTIONS))),
+        (weight > 0) & ((n < AFTER_BISECTIONS) | ((n == AFTER_BISECTIONS) & (unchanged >= CRACK_BISECTIONS))),
         exclude=[probe],
         label="pathreplay: bisection",
     ):
-        at_first, at_second, bisects = n == 0, n == 1, n >= ENDS_AND_MIDDLE
-        in_middle = (n >= ENDS) & ~bisects
-        halve, step = n < END, BEYOND * (b - a)
+        at_first, at_second, bisects = n == 0, n == 1, n >= AFTER_MIDDLE
+        in_middle = (n >= AFTER_ENDS) & ~bisects
+        halve, step = n < AFTER_BISECTIONS, BEYOND * (b - a)
         c = dr.select(halve, 0.5 * (a + b), dr.select(was_left, a - step, b + step))
-        c = dr.select(in_middle, middle.position(n - ENDS, length), c)
+        c = dr.select(in_middle, middle.position(n - AFTER_ENDS, length), c)
         seen = probe(dr.select(at_first, a, dr.select(at_second, b, c)), mi.Bool(True))
 
         at_a, at_b = dr.select(at_first, seen, at_a), dr.select(at_second, seen, at_b)
         to_a, to_b = seen.edge_importance(at_a), seen.edge_importance(at_b)
-        middle = dr.select(in_middle, middle.after(n - ENDS, (to_a > 0) | (to_b > 0)), middle)
-        weight *= dr.select(n == ENDS_AND_MIDDLE - 1, middle_weight(middle.fraction), 1)
+        middle = dr.select(in_middle, middle.after(n - AFTER_ENDS, (to_a > 0) | (to_b > 0)), middle)
+        weight *= dr.select(n == AFTER_MIDDLE - 1, middle_weight(middle.fraction), 1)
 
         total = to_a + to_b
         left = (to_b == 0) | (generator.next_float32(bisects) * total < to_a)
@@ -294,5 +294,5 @@ def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32
         was_left = bisects & left
         a, at_a = dr.select(bisects & ~left & halve, c, a), dr.select(bisects & ~left, seen, at_a)
         b, at_b = dr.select(bisects & left & halve, c, b), dr.select(bisects & left, seen, at_b)
-        n = dr.select(at_second & (to_a > 0), ENDS_AND_MIDDLE, n + 1)
+        n = dr.select(at_second & (to_a > 0), AFTER_MIDDLE, n + 1)
     return Bracket(a, b, weight)

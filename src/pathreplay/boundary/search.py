@@ -57,7 +57,8 @@ class EdgeSearch(ABC, Generic[Segments]):
         A secondary search probes all segments of ``n`` paths instead. A part consists of every k-th segment, because
         consecutive segments are close to each other on the film.
         """
-        dr.make_opaque(seed)  # the kernels of the pilot pass use another seed
+        seed = mi.UInt32(seed)
+        dr.make_opaque(seed)  # the pilot pass launches the same kernels with another seed
         search = self.guided(n, seed)
         parts = -(-n // AT_ONCE)
         for part in range(parts):
@@ -80,9 +81,9 @@ class EdgeSearch(ABC, Generic[Segments]):
         return self.draw(first + step * dr.arange(mi.UInt32, count), mi.UInt32(0), n, seed)
 
     def pilot(self, n: int, seed: mi.UInt32) -> Segments:
-        """Draw the segments of a pilot pass.
+        """Draw the segments of a pilot pass; ``n`` is the number of segments of the pass that follows.
 
-        They are drawn like other segments, so that one kernel detects the edges on both.
+        They are drawn like the segments of that pass, so that one kernel detects the edges on both.
         """
         n, seed = pilot_size(n, self.film.size), Stream.PILOT.of(seed)
         dr.make_opaque(seed)
@@ -199,8 +200,12 @@ def _index_at(cdf: mi.Float64, x: mi.Float64 | mi.Float) -> mi.UInt32:
 
 
 def pilot_size(n: int, size: mi.ScalarVector2f) -> int:
-    """Return the number of pilot segments, for ``n`` segments on a film of ``size`` pixels; at most `AT_ONCE`."""
-    return max(min(n // PILOT_RATIO, PILOT_PER_PIXEL * int(size.x) * int(size.y), AT_ONCE), 1)
+    """Return the number of pilot segments, for ``n`` segments on a film of ``size`` pixels; about `AT_ONCE` at most.
+
+    It is odd. If it divided the number of pixels, and the quotient divided the width of the film, all rows of the film
+    would have pilot segments in the same columns.
+    """
+    return min(n // PILOT_RATIO, PILOT_PER_PIXEL * int(size.x) * int(size.y), AT_ONCE) | 1
 
 
 @dataclass(frozen=True)
@@ -240,10 +245,12 @@ class SegmentDensity:
         previous = self._probability(dr.arange(mi.UInt32, n))
         probability = dr.select(total > 0, dr.fma(counts, (1 - unrefined) / total, unrefined * previous), previous)
         cdf = dr.cumsum(mi.Float64(probability))
-        return SegmentDensity(self.width, self.height, self.margin, cdf / dr.gather(mi.Float64, cdf, n - 1))
+        cdf /= dr.gather(mi.Float64, cdf, n - 1)
+        dr.eval(cdf)
+        return replace(self, cdf=cdf)
 
     def tabulated(self) -> SegmentDensity:
-        """Return this density, with a table of its cumulative probabilities."""
+        """Return this density with a table of cumulative probabilities. Without a table, `draw` has another kernel."""
         if self.cdf is not None:
             return self
         n = self.width * self.height

@@ -128,13 +128,13 @@ class Pass:
         """Create the Sobol sampler of one path of a pixel.
 
         ``path`` is the index of the path in the pixel, which has ``paths`` paths in total. ``pixel`` is the row-major
-        index of the pixel in a film of ``width`` pixels. Samplers with different values of ``of`` are independent. The
-        kernels depend neither on ``width`` nor on ``paths``.
+        index of the pixel in a film of ``width`` pixels. Samplers with different values of ``of`` are independent.
+        Kernels do not depend on ``paths``.
         """
-        bits, row = dr.opaque(mi.UInt32, (paths - 1).bit_length()), dr.opaque(mi.UInt32, width)
-        morton = morton_index(pixel % row, pixel // row)
+        bits = dr.opaque(mi.UInt32, (paths - 1).bit_length())
+        morton = morton_index(pixel % width, pixel // width)
         # A Sobol index has 32 bits. The bits of ``morton`` that do not fit select the set of samples, with the seed and
-        # ``of``. The index of a pixel has fewer than 32 bits.
+        # ``of``. There are two shifts, because a shift by 32 bits (if ``bits`` is 0) is undefined.
         overflow = (morton >> 1) >> (31 - bits)
         return OwenSobolSampler.of((morton << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), overflow))
 

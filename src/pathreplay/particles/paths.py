@@ -58,11 +58,10 @@ class Particles:
         """Number of lanes."""
         return min(self.number, LANES_GPU if device_of(mi.variant()).is_gpu else LANES)
 
-    def start(self, trace: TraceConfig, i: mi.UInt32) -> EmitterStart:
-        """Return the start of the light paths with indices ``i``; lanes with ``i`` >= ``number`` are inactive."""
+    def start(self, trace: TraceConfig, i: mi.UInt32, active: mi.Bool | bool = True) -> EmitterStart:
+        """Return the start of the light paths with indices ``i``."""
         sampler = OwenSobolSampler.of(i, self.key)
-        active = i < dr.opaque(mi.UInt32, self.number)  # kernels do not depend on the number
-        return EmitterStart(trace, self.emission, EmitterSamples.draw(sampler), sampler, active)
+        return EmitterStart(trace, self.emission, EmitterSamples.draw(sampler), sampler, mi.Bool(active))
 
     def moves(self, trace: TraceConfig) -> bool:
         """Return whether light paths or their film positions depend on parameters with gradients."""
@@ -81,7 +80,7 @@ def particle_image(trace: TraceConfig, particles: Particles, film: ParticleFilm)
     lanes, number = dr.opaque(mi.UInt32, particles.lanes), dr.opaque(mi.UInt32, particles.number)
 
     while dr.hint(i < number, exclude=[trace, particles, film, sums], label="pathreplay: particles"):
-        start = particles.start(trace, i)
+        start = particles.start(trace, i, i < number)
         splat_path(trace, start.sampler, PathState.begin(trace, start), start.W, film, sums)
         i += lanes
 
@@ -117,7 +116,7 @@ def particle_tangent(
     trace = along_moving_paths(trace, moves)
 
     while dr.hint(i < number, exclude=[trace, particles, film, sums, lost, moves], label="pathreplay: particles"):
-        start = particles.start(trace, i)
+        start = particles.start(trace, i, i < number)
         with dr.resume_grad():
             ray0, W0 = start.emit()
             δo, δd, δβ = tangents(ray0.o, ray0.d, W0)
@@ -195,7 +194,7 @@ def particle_sweep(
         exclude=[trace, particles, lost, layout, moves, varies, starts, start0, at0],
         label="pathreplay: particles",
     ):
-        start = particles.start(trace, i)
+        start = particles.start(trace, i, i < number)
         path = PathState.begin(trace, start, sustained=True)
         ray0 = path.at.ray
         records, count, L, _beyond, _branch = record_path(

@@ -160,7 +160,6 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         _, x = path.vertex(self.trace, self.film, self.shares, None, None)
         observer, n = ObserverVertex(self.trace, x), dr.width(path.key)
         none = dr.zeros(mi.Float, n)
-        path.density += none  # broadcast to the number of paths
 
         def per_path(found: Importance) -> Importance:
             return replace(found, presence=found.presence / path.density, edges=found.edges + none)

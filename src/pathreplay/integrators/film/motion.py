@@ -168,7 +168,7 @@ class FilmMotion(Term):
         places, filter, derivative = FilmPlaces.of(view), FilterSamples.of(film), FilterSamples.of_derivative(film)
         middle = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + 0.5
         middle += mi.Point2f(mi.ScalarPoint2f(film.crop_offset()) - places.corner)
-        s, weight, offset = mi.Point2f(0), dr.rcp(mi.Float(groups)), mi.Float(0)
+        s, weight, offset = mi.Point2f(0), dr.opaque(mi.Float, 1 / number), mi.Float(0)
         for k in range(2):
             low, high = filter.cdf_at(-middle[k]), filter.cdf_at(places.size[k] - middle[k])
             x, away = filter.draw(u[k], low, high), derivative.draw(u[k], mi.Float(0.5), mi.Float(1))
