@@ -43,6 +43,7 @@ def main(text: str) -> list[float]:
     from benchmarks.measures.job import Job
     from benchmarks.scenes import SCENES
 
+    mi.set_log_level(mi.LogLevel.Error)  # warnings would precede the list
     job = Job.decode(text)
     scene = mi.load_dict(SCENES[job.scene](job.resolution), optimize=False)
     params = mi.traverse(scene)

@@ -8,9 +8,6 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from pathreplay.platform import compat
 
@@ -37,8 +34,7 @@ def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WEL
     ``weld`` = 0 they must be exactly equal.
     """
     count = len(positions)
-    links = coo_matrix((np.ones(faces.size, bool), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), (count, count))
-    groups = connected_components(links, directed=False)[1][faces[:, 0]]
+    groups = _components(faces.ravel(), np.roll(faces, 1, axis=1).ravel(), count)[faces[:, 0]]
     sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2).astype(np.int64), axis=1)
     _, side, shared = np.unique(sides[:, 0] * count + sides[:, 1], return_inverse=True, return_counts=True)
     alone = np.flatnonzero(shared[side] == 1)
@@ -57,11 +53,24 @@ def _places(positions: np.ndarray, vertices: np.ndarray, weld: float) -> np.ndar
     Modelling programs compute both ends of a seam separately, for example as sin 0 and sin 2π. The two results differ
     in the last bits.
     """
+    from scipy.spatial import cKDTree
+
     ends, at = np.unique(vertices, return_inverse=True)
     if not len(ends):
         return at
     diagonal = np.linalg.norm(np.ptp(positions, axis=0))
     near = weld * diagonal + ULPS * np.finfo(np.float32).eps * np.abs(positions).max() if weld else 0.0
     pairs = cKDTree(positions[ends]).query_pairs(near, output_type="ndarray")
-    same = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (len(ends), len(ends)))
-    return connected_components(same, directed=False)[1][at]
+    return _components(pairs[:, 0], pairs[:, 1], len(ends))[at]
+
+
+def _components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
+    """Return the index of the connected component of each of ``count`` nodes; node a[i] is linked to node b[i].
+
+    SciPy is imported here, because importing it takes long, and most processes do not need it.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_matrix((np.ones(len(a), bool), (a, b)), (count, count))
+    return connected_components(links, directed=False)[1]
