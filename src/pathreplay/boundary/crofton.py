@@ -232,10 +232,11 @@ class MiddlePart:
 
     fraction: mi.Float  # length of the interval, relative to the segment; complete after 2 `PARTS` probes
     reach: mi.Float  # largest distance from the middle with a different probe, relative to a half of the segment
-    step: mi.Float
+    step: mi.Float  # distance of the next probe from ``reach``, in the same unit
 
     @staticmethod
     def begin() -> MiddlePart:
+        """Return the interval before the first probe."""
         return MiddlePart(mi.Float(0), mi.Float(0), mi.Float(0.5))
 
     def position(self, n: mi.UInt32, length: mi.Float) -> mi.Float:
