@@ -348,6 +348,18 @@ def test_motion_on_a_film_with_a_box_filter_is_told_once(log: list[str]) -> None
     assert "\n" not in told[0] and "use a 'tent' or 'gaussian' filter" in told[0]
 
 
+def test_the_filter_of_a_meter_is_not_told(log: list[str]) -> None:
+    """What a meter measures does not depend on the place of a light path in its only pixel."""
+    made = {**slab(), "sensor": meter()}
+    scene, integrator = loaded(made), mi.load_dict({**PARTICLES, "max_depth": 4})
+    params = mi.traverse(scene)
+    dr.enable_grad(params["top.vertex_positions"])
+    params.update()
+    integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (1, 1, 3)), 0, 1, 64)
+    assert dr.any(dr.grad(params["top.vertex_positions"]) != 0)
+    assert log and not any("box filter" in line for line in log), log
+
+
 def test_colours_on_a_film_with_a_box_filter_are_told_nothing(log: list[str]) -> None:
     scene = balls(light="point", sensor=sensor(rfilter="box"))
     gradient(loaded(scene), PARTICLES, "floor.bsdf.reflectance.value", 4)

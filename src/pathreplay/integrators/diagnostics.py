@@ -185,7 +185,7 @@ def particle_notes(trace: TraceConfig, sensor: mi.Sensor, omitted: Iterable[str]
 
     ``omitted`` lists the edges that are left out.
     """
-    if sensor.film().rfilter().is_box_filter():
+    if sensor.film().rfilter().is_box_filter() and sensor.class_name() != METER:
         yield (
             f"the film of sensor '{sensor.id()}' has a box filter, whose derivative is zero: the motion of light paths "
             "across pixels is missing from the gradient; use a 'tent' or 'gaussian' filter"
