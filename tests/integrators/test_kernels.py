@@ -16,7 +16,7 @@ import pytest
 
 import edge_media_scenes as media
 import edge_scenes as scenes
-from truth import RES, translate
+from truth import translate
 
 FEW = 1000
 """Operations of kernels that may be compiled again: sums over all samples, and the like."""
@@ -48,14 +48,13 @@ def parts() -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("make", PASSES.values(), ids=PASSES)
-def test_other_samples_are_no_other_kernels(make: Callable[[], tuple[dict[str, Any], dict[str, Any]]]) -> None:
+def launched(options: dict[str, Any], described: dict[str, Any], *samples: int) -> list[list[dict[str, Any]]]:
+    """The kernels of an image and its gradient, for each number of samples per pixel."""
     gc.collect()  # Dr.Jit traces calls through all scenes alive: one that goes between two passes makes other kernels
-    options, described = make()
     scene = mi.load_dict(described)
     params, integrator = mi.traverse(scene), mi.load_dict({"type": "pathreplay", "max_depth": 4, **options})
-    rest, compiled = mi.Transform4f(params["object.to_world"]), []
-    for spp in (16, 16, 8, 64):
+    rest, found = mi.Transform4f(params["object.to_world"]), []
+    for spp in samples:
         x = mi.Float(0)
         dr.enable_grad(x)
         params["object.to_world"] = translate(1, 0, 0)(rest, x)
@@ -65,24 +64,20 @@ def test_other_samples_are_no_other_kernels(make: Callable[[], tuple[dict[str, A
             image = mi.render(scene, params, integrator=integrator, seed=1, spp=spp)
             dr.backward(dr.sum(image, axis=None))
             dr.eval()
-            history = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
-        compiled.append(sum(entry["operation_count"] for entry in history if not entry["cache_hit"]))
-    assert sum(entry["operation_count"] for entry in history) > 5 * FEW
+            found.append([entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT])
+    return found
+
+
+@pytest.mark.parametrize("make", PASSES.values(), ids=PASSES)
+def test_other_samples_are_no_other_kernels(make: Callable[[], tuple[dict[str, Any], dict[str, Any]]]) -> None:
+    passes = launched(*make(), 16, 16, 8, 64)
+    compiled = [sum(entry["operation_count"] for entry in each if not entry["cache_hit"]) for each in passes]
+    assert sum(entry["operation_count"] for entry in passes[-1]) > 5 * FEW
     assert max(compiled[2:]) < FEW, compiled
 
 
 def test_a_pilot_pass_launches_the_kernels_of_the_search() -> None:
     """Edges that the camera sees, edges that surfaces see, and those behind the pane: each twice."""
-    gc.collect()
-    scene = mi.load_dict(scenes.scene(**parts()))
-    params = mi.traverse(scene)
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 4, "boundary": "all"})
-    x = mi.Float(0)
-    dr.enable_grad(x)
-    params["object.to_world"] = translate(1, 0, 0)(mi.Transform4f(params["object.to_world"]), x)
-    params.update()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (RES, RES, 3)), spp=16)
-        launched = Counter(entry["hash"] for entry in dr.kernel_history() if entry.get("operation_count", 0) > FEW)
-    assert sum(count == 2 for count in launched.values()) >= 3, launched
+    (kernels,) = launched(*PASSES["pane"](), 16)
+    times = Counter(entry["hash"] for entry in kernels if entry["operation_count"] > FEW)
+    assert sum(count == 2 for count in times.values()) >= 3, times

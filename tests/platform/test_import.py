@@ -5,11 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 
+from variant import BACKEND
+
 LATER = "scipy", "matplotlib", "pydantic", "rich", "jinja2", "trimesh"
 CODE = f"""
 import sys
 import pathreplay, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
+mi.set_variant("{BACKEND}_ad_rgb")
 mi.load_dict({{"type": "pathreplay"}})
 print(*(name for name in {LATER} if name in sys.modules))
 """

@@ -215,6 +215,7 @@ def _split_later(
     return a, b, parted
 
 
+@dr.syntax
 def record_chain(
     trace: TraceConfig, s: mi.Point2f, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, at: mi.Ray3f, active: mi.Bool
 ) -> tuple[EdgePath, mi.Bool]:
@@ -224,18 +225,8 @@ def record_chain(
     the chain passes all ``k`` vertices. In a scene without delta lobes, ``k`` is 0, and nothing is recorded.
     """
     layout = Layout.of(trace, True)
-    if not trace.traits.mirrors:
+    if dr.hint(not trace.traits.mirrors, mode="scalar"):
         return EdgePath(s, key, mi.UInt32(0), at, layout, None), active
-    records, count = _records_of_chain(trace, layout, ray, key, k, active)
-    reached = active & (count == k + 1)
-    return EdgePath(s, key, dr.select(reached, k, 0), at, layout, records), reached
-
-
-@dr.syntax
-def _records_of_chain(
-    trace: TraceConfig, layout: Layout, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, active: mi.Bool
-) -> tuple[dr.Local[object], mi.UInt32]:
-    """Record at most k + 1 vertices of a chain; return the records and their number."""
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
     sampler = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, sampler, active))
@@ -247,9 +238,11 @@ def _records_of_chain(
         records[count] = record(layout, v)
         path = onward
         count += 1
-    return records, count
+    reached = active & (count == k + 1)
+    return EdgePath(s, key, dr.select(reached, k, 0), at, layout, records), reached
 
 
+@dr.syntax
 def transmittance_of_chain(
     trace: TraceConfig,
     ray: mi.Ray3f,
@@ -264,24 +257,10 @@ def transmittance_of_chain(
     The chain starts in ``medium``. Also returns the medium at the distance ``reach``.
     """
     chain = chain_config(trace)
-    path = PathState.begin(chain, CameraStart(ray, CounterSampler.of(key), active))
-    if not trace.traits.mirrors:
-        sampler = CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_CHAIN)
-        return transmittance_up_to(trace, path.at.ray, reach, medium, sampler, path.active)
-    return _transmittance_of_chain(trace, chain, path, medium, key, k, reach)
-
-
-@dr.syntax
-def _transmittance_of_chain(
-    trace: TraceConfig,
-    chain: TraceConfig,
-    path: PathState,
-    medium: mi.MediumPtr,
-    key: mi.UInt32,
-    k: mi.UInt32,
-    reach: mi.Float,
-) -> tuple[mi.Spectrum, mi.MediumPtr]:
     sampler, transmittance_sampler = CounterSampler.of(key), CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_CHAIN)
+    path = PathState.begin(chain, CameraStart(ray, sampler, active))
+    if dr.hint(not trace.traits.mirrors, mode="scalar"):
+        return transmittance_up_to(trace, path.at.ray, reach, medium, transmittance_sampler, path.active)
     T = mi.Spectrum(1)
     count = mi.UInt32(0)
     while dr.hint(path.active & (count <= k), exclude=[trace, chain], label="pathreplay: transmittance of a chain"):

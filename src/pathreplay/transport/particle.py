@@ -70,20 +70,9 @@ def choose_step(
     kept.lit = lit
     splat = Splat(dr.select(lit, c, 0), to.s)
     e, ray_next, met = _weighted(link, splat, at, lit), v.origin.spawn_ray(kept.d), v.met(go_on)
+    eta, u = mi.Float(1), sampled.u
     return SampledStep(
-        e,
-        w,
-        ray_next,
-        kept.pdf,
-        met,
-        kept,
-        mi.Float(1),
-        sampled.null,
-        going,
-        u=sampled.u,
-        u_weight=sampled.u_weight,
-        medium=medium,
-        splat=splat,
+        e, w, ray_next, kept.pdf, met, kept, eta, sampled.null, going, u, sampled.u_weight, medium, splat=splat
     )
 
 
